@@ -1,0 +1,41 @@
+"""The noise of a camera: fit it to dark frames, sample from it. See README.md."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from hsnoise import cameras
+from hsnoise.effects import AbstractEffect, Stage, param
+from hsnoise.fit import FitResult, fit
+from hsnoise.io import load
+from hsnoise.likelihood import log_likelihood
+from hsnoise.model import NoiseModel, sample, sample_dark
+from hsnoise.photometry import photoelectrons_from_illuminance
+from hsnoise.stack import FrameStack
+from hsnoise.statistics import summarise
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AbstractEffect",
+    "FitResult",
+    "FrameStack",
+    "NoiseModel",
+    "Stage",
+    "cameras",
+    "fit",
+    "load",
+    "log_likelihood",
+    "param",
+    "photoelectrons_from_illuminance",
+    "sample",
+    "sample_dark",
+    "summarise",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "plots":  # brings matplotlib, which is slow to import
+        return import_module("hsnoise.plots")
+    raise AttributeError(f"module 'hsnoise' has no attribute {name!r}")

@@ -1,0 +1,138 @@
+"""What the commands of the command line take."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hsnoise._output import FRAME_FORMATS
+from hsnoise._types import BAYER_CFAS, SHUTTERS
+from hsnoise.cameras import canon_5d3, grasshopper3
+
+CAMERAS = {"canon_5d3": canon_5d3, "grasshopper3": grasshopper3}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of `hsnoise demo`, `fit` and `sample`; `command` names which, or is None."""
+    top = argparse.ArgumentParser(
+        prog="hsnoise",
+        description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
+        "the same noise. New here? Run: hsnoise demo",
+    )
+    commands = top.add_subparsers(dest="command", metavar="COMMAND")
+    _demo_arguments(commands)
+    _fit_arguments(commands)
+    _sample_arguments(commands)
+    for command in commands.choices.values():
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return top
+
+
+def _demo_arguments(commands: Any) -> None:
+    text = (
+        "Simulate a small dark capture of a Canon 5D Mark III at ISO 25600, fit it, and show the fit beside the truth."
+    )
+    demo = commands.add_parser(
+        "demo", help="see what hsnoise does, on simulated or on your own frames", description=text
+    )
+    demo.add_argument(
+        "--data", nargs="+", metavar="PATH", help="fit these dark frames instead: a folder, files or a pattern"
+    )
+    demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
+    _capture_arguments(demo)
+
+
+def _fit_arguments(commands: Any) -> None:
+    text = (
+        "Fit the noise model to dark frames. Takes raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files, all at one ISO, "
+        "best at several exposures. Writes model.json, table.csv and figures to a folder."
+    )
+    fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
+    fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
+    fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
+    _capture_arguments(fit)
+
+
+def _capture_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--method",
+        choices=("auto", "ml", "line"),
+        default="auto",
+        help="ml: maximum likelihood; line: the paper's line fit; auto (default): ml, or else line",
+    )
+    group = parser.add_argument_group("what the files do not say", "each overrides what the files say")
+    group.add_argument("--exposure", type=_numbers, metavar="S[,S...]", help="exposure in seconds, one or one per file")
+    group.add_argument("--kind", choices=("dark", "flat"), help="what the frames are, if not dark")
+    group.add_argument("--cfa", type=_cfa, metavar="CFA", help=f"mono or the Bayer order: {', '.join(BAYER_CFAS)}")
+    group.add_argument("--black-level", type=_numbers, metavar="DN[,DN,DN]", help="one, or one for each of R, G, B")
+    group.add_argument("--white-level", type=float, metavar="DN", help="count at which the sensor saturates")
+    group.add_argument("--shutter", choices=SHUTTERS)
+    group.add_argument(
+        "--row-axis",
+        type=int,
+        choices=(0, 1),
+        default=0,
+        help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait",
+    )
+    group.add_argument("--roi", type=_roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
+    group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
+    group.add_argument("--flats-exposure", type=_numbers, metavar="S[,S...]", help="their exposure in seconds")
+
+
+def _sample_arguments(commands: Any) -> None:
+    text = "Draw raw frames from a noise model: dark frames, or noisy frames of a clean image."
+    sample = commands.add_parser("sample", help="make frames with the noise of a camera", description=text)
+    sample.add_argument("model", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}")
+    sample.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help=f"file to write: {' '.join(FRAME_FORMATS)}"
+    )
+    sample.add_argument("--frames", type=_positive, default=8, metavar="N", help="frames of each exposure (default 8)")
+    sample.add_argument(
+        "--exposure", type=_numbers, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
+    )
+    sample.add_argument(
+        "--shape", type=_shape, default=(480, 640), metavar="ROWSxCOLUMNS", help="of dark frames (480x640)"
+    )
+    sample.add_argument(
+        "--clean",
+        metavar="IMAGE",
+        help="clean image (.npy, .tif, .png) of expected photoelectrons per pixel; R, G, B or a mosaic",
+    )
+    sample.add_argument(
+        "--mean-e", type=float, metavar="E", help="scale the clean image to this mean, in photoelectrons"
+    )
+    sample.add_argument("--seed", type=int, default=0, help="same seed, same frames (default 0)")
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split(",")]
+
+
+def _cfa(text: str) -> str:
+    if text.lower() == "mono":
+        return "mono"
+    if text.upper() not in BAYER_CFAS:
+        raise argparse.ArgumentTypeError(f"expected mono or one of {', '.join(BAYER_CFAS)}, got {text!r}")
+    return text.upper()
+
+
+def _positive(text: str) -> int:
+    if not (text.isdigit() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
+    return int(text)
+
+
+def _shape(text: str) -> tuple[int, int]:
+    words = text.lower().split("x")
+    if len(words) != 2:
+        raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS such as 480x640, got {text!r}")
+    return _positive(words[0]), _positive(words[1])
+
+
+def _roi(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    try:
+        (r0, r1), (c0, c1) = (map(int, span.split(":")) for span in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected R0:R1,C0:C1 such as 0:512,100:612, got {text!r}") from None
+    return (r0, r1), (c0, c1)

@@ -1,0 +1,54 @@
+"""Array aliases and the colour filter array: what every layer above agrees on.
+
+Shapes are named by jaxtyping: `frame`, `row`, `column`, `channel`. A channel is a colour; the two greens of a
+Bayer sensor are one channel.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt, UInt32
+
+Scalar = Float[Array, ""]
+PerChannel = Float[Array, "*channel"]  # a scalar until the model spreads it over its channels
+Frames = Float[Array, "frame row column"]
+FrameRows = Float[Array, "frame row channel"]  # one number for each row of each colour
+PixelMap = Float[Array, "1 row column"]
+Counts = UInt[Array, "frame row column"]
+RandomKey = Key[Array, ""] | UInt32[Array, "2"]
+
+BAYER_CFAS = ("RGGB", "BGGR", "GRBG", "GBRG")
+SHUTTERS = ("rolling", "global")
+
+
+def channels_of(cfa: str) -> tuple[str, ...]:
+    """Names of the channels of a colour filter array: ("mono",) or ("R", "G", "B").
+
+    Raises:
+        ValueError: if `cfa` is neither "mono" nor a 2x2 Bayer string such as "RGGB".
+    """
+    if cfa == "mono":
+        return ("mono",)
+    if cfa in BAYER_CFAS:
+        return ("R", "G", "B")
+    raise ValueError(f"cfa: expected 'mono' or one of {', '.join(BAYER_CFAS)}, got {cfa!r}.")
+
+
+def cfa_tile(cfa: str) -> np.ndarray:
+    """Channel index of each pixel of the array's unit cell: [[0]] for mono, [row, column] 2 x 2 for Bayer."""
+    channels = channels_of(cfa)
+    if cfa == "mono":
+        return np.zeros((1, 1), int)
+    return np.array([channels.index(letter) for letter in cfa]).reshape(2, 2)
+
+
+def check_shutter(shutter: str) -> None:
+    """Raise ValueError unless `shutter` is "rolling" or "global"."""
+    if shutter not in SHUTTERS:
+        raise ValueError(f"shutter: expected 'rolling' or 'global', got {shutter!r}.")
+
+
+def is_traced(x) -> bool:
+    """True if `x` has no value yet, inside jit, vmap or grad; its values cannot be checked then."""
+    return isinstance(x, jax.core.Tracer)

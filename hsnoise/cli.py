@@ -1,0 +1,282 @@
+"""The command line: `hsnoise demo`, `hsnoise fit`, `hsnoise sample`."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, track
+from rich.table import Table
+
+import hsnoise
+from hsnoise import _options, cameras
+from hsnoise._options import CAMERAS
+from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically
+from hsnoise._types import cfa_tile
+from hsnoise.fit import FitResult
+from hsnoise.model import NoiseModel
+from hsnoise.photometry import scale_to_photoelectrons
+from hsnoise.stack import FrameStack
+
+DEMO_EXPOSURES_S, DEMO_FRAMES, DEMO_SHAPE, DEMO_SEED = (0.05, 0.1, 0.2, 0.4), 8, (160, 240), 0
+
+MEANING = """\
+One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
+reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
+`row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
+errors do not say: whether the model is right; look at the residuals in histograms.png."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, or 2 after an error, which is reported in one sentence."""
+    parser = _options.parser()
+    args = parser.parse_args(argv)
+    if args.command is None:
+        parser.print_help()
+        return 2
+    try:
+        RUN[args.command](args)
+    except (ValueError, TypeError, OSError, RuntimeError) as error:
+        if args.debug:
+            raise
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"hsnoise: {_sentence(error)}", markup=False)
+        return 2
+    except KeyboardInterrupt:
+        print("hsnoise: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split())
+
+
+# Commands
+
+
+def _demo(args: argparse.Namespace) -> None:
+    console, out = Console(highlight=False), args.out
+    _check_folder(out)
+    if args.data:
+        _fit_and_report(console, _load(args.data, args), args.method, out, {"files": args.data}, truth=None)
+        return
+    truth = cameras.canon_5d3()
+    rows, columns = DEMO_SHAPE
+    console.print(f"Simulating {len(DEMO_EXPOSURES_S) * DEMO_FRAMES} dark frames of {rows} x {columns} pixels ...")
+    counts = _draw(truth, DEMO_EXPOSURES_S, DEMO_FRAMES, np.zeros(DEMO_SHAPE, np.float32), DEMO_SEED)
+    metadata = _metadata(truth, DEMO_EXPOSURES_S, "dark")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / "capture.npz", frames_file(".npz", counts, metadata))
+    stack = FrameStack(counts, **metadata)
+    _fit_and_report(console, stack, args.method, out, {"simulated": "canon_5d3", "seed": DEMO_SEED}, truth=truth)
+    again = f"The simulated frames are there, too. Fit them again with: hsnoise fit {out / 'capture.npz'}"
+    console.print(again, markup=False, soft_wrap=True)
+
+
+def _fit(args: argparse.Namespace) -> None:
+    _check_folder(args.out)
+    stack = _load(args.paths, args)
+    _fit_and_report(Console(highlight=False), stack, args.method, args.out, {"files": args.paths}, truth=None)
+
+
+def _fit_and_report(
+    console: Console, stack: FrameStack, method: str, out: Path, source: dict[str, Any], truth: NoiseModel | None
+) -> None:
+    stack.check()
+    out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
+    console.print(str(stack), markup=False)
+    fit = _fit_with_progress(stack, method)
+    console.print(_table(fit, truth))
+    console.print(
+        f"Fit by {'maximum likelihood' if fit.method == 'ml' else 'the line method'}: {fit.outcome}", markup=False
+    )
+    for note in fit.notes:
+        console.print(f"- {note}", style="yellow", markup=False)
+    written = _write_results(fit, out, source)
+    console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
+    console.print(MEANING, markup=False)
+    if truth is not None:
+        console.print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
+
+
+def _sample(args: argparse.Namespace) -> None:
+    suffix = args.out.suffix.lower()
+    if suffix not in FRAME_FORMATS:
+        raise ValueError(f"--out: expected a file ending in {', '.join(FRAME_FORMATS)}, got {args.out}")
+    if not args.out.parent.is_dir():
+        raise ValueError(f"--out: there is no folder {args.out.parent}")
+    if args.mean_e is not None and args.clean is None:
+        raise ValueError("--mean-e: goes with --clean, the image that it scales")
+    model = _model(args.model)
+    exposures_s = args.exposure or [model.exposure_s]
+    clean = np.zeros(args.shape, np.float32) if args.clean is None else _clean(args.clean, args.mean_e, model)
+    counts = _draw(model, exposures_s, args.frames, clean, args.seed)
+    metadata = _metadata(model, exposures_s, "flat" if args.clean else "dark")
+    write_atomically(args.out, frames_file(suffix, counts, metadata))
+    n, frames, rows, columns = counts.shape
+    print(f"{args.out}: {n * frames} frames of {rows} x {columns} pixels, counts {counts.min()} to {counts.max()} DN")
+
+
+# Work
+
+
+def _load(paths: list[str], args: argparse.Namespace) -> FrameStack:
+    """Darks, and flats if there are any, as one stack."""
+    options = {
+        "cfa": args.cfa,
+        "black_level": _one_or_list(args.black_level),
+        "white_level": args.white_level,
+        "shutter": args.shutter,
+        "row_axis": args.row_axis,
+        "roi": args.roi,
+    }
+    groups = _captures(paths, exposure_s=_one_or_list(args.exposure), kind=args.kind, **options)
+    if args.flats:
+        groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
+    return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
+
+
+def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
+    """Several files are one capture, several folders or patterns one each."""
+    if len(paths) > 1 and all(Path(path).is_file() for path in paths):
+        return [hsnoise.load(paths, **options)]
+    return [hsnoise.load(path, **options) for path in paths]
+
+
+def _fit_with_progress(stack: FrameStack, method: str) -> FitResult:
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("Reading frames", total=sum(stack.n_frames))
+
+        def tick() -> None:
+            progress.advance(task)
+            if progress.finished:
+                progress.add_task("Fitting", total=None)
+
+        return hsnoise.fit(stack, method=method, progress=tick)
+
+
+def _model(name: str) -> NoiseModel:
+    if name in CAMERAS:
+        return CAMERAS[name]()
+    if not Path(name).is_file():
+        raise ValueError(f"model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
+    return NoiseModel.load(name)
+
+
+def _one_or_list(numbers: list[float] | None) -> Any:
+    return numbers[0] if numbers is not None and len(numbers) == 1 else numbers
+
+
+def _draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray, seed: int) -> np.ndarray:
+    """Counts `[exposure, frame, row, column]`, frame by frame so that memory holds one."""
+    key = jax.random.key(seed)
+    tasks = [(e, f) for e in range(len(exposures_s)) for f in range(n_frames)]
+    console = Console(stderr=True)
+    frames = []
+    for e, f in track(tasks, "Drawing frames", console=console, transient=True, disable=not console.is_terminal):
+        frame_key = jax.random.fold_in(jax.random.fold_in(key, e), f)
+        frames.append(np.asarray(hsnoise.sample(frame_key, clean, model, exposure_s=exposures_s[e])))
+    counts = np.stack(frames).reshape(len(exposures_s), n_frames, *clean.shape)
+    return counts.astype(np.uint16) if counts.max() <= np.iinfo(np.uint16).max else counts
+
+
+def _metadata(model: NoiseModel, exposures_s: Any, kind: str) -> dict[str, Any]:
+    metadata = {"exposure_s": np.asarray(exposures_s, float), "kind": kind, "cfa": model.cfa, "shutter": model.shutter}
+    black_level = np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(1)
+    metadata["black_level"] = black_level if np.ptp(black_level) > 0 else float(black_level[0])
+    if "adc" in model and model["adc"].white_level_dn is not None:
+        metadata["white_level"] = float(model["adc"].white_level_dn)
+    return metadata
+
+
+def _clean(path: str, mean_e: float | None, model: NoiseModel) -> np.ndarray:
+    """Expected photoelectrons `[row, column]`: of an image in R, G, B each pixel keeps its own colour."""
+    image = read_image(path).astype(np.float32)
+    if image.ndim == 3:
+        if model.cfa == "mono":
+            raise ValueError(f"{path}: a colour image, but the sensor is mono; give an image [row, column]")
+        tile = cfa_tile(model.cfa)
+        row, column = np.indices(image.shape[:2])
+        image = image[row, column, tile[row % 2, column % 2]]
+    return image if mean_e is None else np.asarray(scale_to_photoelectrons(image, mean_e))
+
+
+# Output
+
+
+def _check_folder(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"--out: expected a folder, but {path} is a file")
+
+
+def _table(fit: FitResult, truth: NoiseModel | None) -> Table:
+    table = Table(box=SIMPLE_HEAD)
+    table.add_column("parameter", no_wrap=True)
+    for name in ("value", "standard error"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("unit")
+    true_values = {} if truth is None else truth.table()
+    if truth is not None:
+        table.add_column("truth", justify="right", no_wrap=True)
+        table.add_column("off by", justify="right", no_wrap=True)
+    for name, (value, error, unit) in fit.table.items():
+        cells = [name, *_rounded(value, error), "" if unit == "1" else unit]
+        if name in true_values:
+            true_value = true_values[name][0]
+            known = error > 0 and np.isfinite(error)
+            cells += [_rounded(true_value, error)[0], f"{(value - true_value) / error:+.1f} s.e." if known else ""]
+        table.add_row(*cells)
+    return table
+
+
+def _rounded(value: float, error: float) -> tuple[str, str]:
+    """Value and standard error with the digits that the error leaves meaning to."""
+    if not (np.isfinite(error) and error > 0):
+        return f"{value:.4g}", "given" if error == 0 else "not determined"
+    digits = max(0, 1 - int(np.floor(np.log10(error))))
+    if digits > 6 or error >= 1e4:
+        return f"{value:.3e}", f"{error:.1e}"
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
+
+
+def _write_results(fit: FitResult, out: Path, source: dict[str, Any]) -> list[str]:
+    """model.json, table.csv and the figures; returns their names."""
+    from hsnoise import plots  # matplotlib is slow to import
+
+    provenance = {
+        **source,
+        "method": fit.method,
+        "outcome": fit.outcome,
+        "standard_errors": {name: error for name, (_, error, _) in fit.table.items() if np.isfinite(error)},
+    }
+    fit.params.save(out / "model.json", provenance=provenance)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["parameter", "value", "standard_error", "unit"])
+    writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.table.items())
+    write_atomically(out / "table.csv", text.getvalue().encode())
+    figures = {"photon_transfer.png": plots.photon_transfer}
+    if fit.summary.histograms:
+        figures["histograms.png"] = plots.histograms
+        if fit.physics.row_sigma is not None:
+            figures["row_spectrum.png"] = plots.row_spectrum
+    for name, draw in figures.items():
+        buffer = io.BytesIO()
+        draw(fit).savefig(buffer, format="png")
+        write_atomically(out / name, buffer.getvalue())
+    return ["model.json", "table.csv", *figures]
+
+
+RUN = {"demo": _demo, "fit": _fit, "sample": _sample}

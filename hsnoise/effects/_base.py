@@ -1,0 +1,209 @@
+"""What an effect is: physical parameters and one method that draws what happens in the sensor.
+
+An effect of one's own is a class of about 20 lines in one's own file:
+
+    class RowOffset(AbstractEffect):
+        name = "row_offset"
+        stage = Stage.READ
+        sigma: Scalar = param("e-", low=0, doc="standard deviation over rows and frames")
+
+        def sample(self, signal, capture, *, key):
+            frames, rows, _ = signal.shape
+            return signal + self.sigma * jax.random.normal(key, (frames, rows, 1), signal.dtype)
+
+    model = model.add(RowOffset(0.5))
+"""
+# No `from __future__ import annotations` here: Equinox must see AbstractClassVar itself, not its text.
+
+import abc
+import dataclasses
+import enum
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._types import (
+    Counts,
+    FrameRows,
+    Frames,
+    PerChannel,
+    PixelMap,
+    RandomKey,
+    Scalar,
+    cfa_tile,
+    channels_of,
+    is_traced,
+)
+
+
+class Stage(enum.IntEnum):
+    """Where in the sensor an effect acts: a model runs effects in this order, then in that of insertion."""
+
+    LIGHT = 0  # changes the expected photoelectrons, e-
+    PHOTONS = 1  # draws the photoelectrons
+    ELECTRONS = 2  # adds electrons, whole numbers
+    READ = 3  # adds to the signal while it is read, e-
+    GAIN = 4  # multiplies; after this stage the signal is in DN
+    BLACK = 5  # adds an offset, DN
+    DIGITAL = 6  # turns DN into counts, or counts into counts
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterSpec:
+    """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning."""
+
+    unit: str
+    low: float | None
+    high: float | None
+    per_channel: bool
+    doc: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One number of a model: name in tables, `<effect>.<parameter>[.<channel>]`, value and declaration."""
+
+    name: str
+    value: float
+    spec: ParameterSpec
+
+
+def _as_leaf(x) -> jax.Array:
+    # An array keeps its own precision: a fit hands over float64 whatever the session uses.
+    return x if eqx.is_inexact_array(x) and isinstance(x, jax.Array) else jnp.asarray(x, float)
+
+
+def param(
+    unit: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    per_channel: bool = False,
+    doc: str = "",
+) -> Any:
+    """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
+
+    Args:
+        unit: its unit, "1" if it has none.
+        low, high: inclusive bounds; None for unbounded.
+        per_channel: one value per colour channel; a scalar given instead holds for all channels.
+        doc: its meaning in a few words.
+    """
+    spec = ParameterSpec(unit, low, high, per_channel, doc)
+    return eqx.field(converter=_as_leaf, metadata={"parameter": spec})
+
+
+class Capture(eqx.Module):
+    """How the frames were taken: what an effect may know besides the signal.
+
+    Attributes:
+        exposure_s: exposure in seconds, scalar.
+        shape: rows and columns of the sensor.
+        cfa: "mono" or a 2x2 Bayer string.
+        shutter: "rolling" or "global".
+    """
+
+    exposure_s: Scalar
+    shape: tuple[int, int] = eqx.field(static=True)
+    cfa: str = eqx.field(static=True)
+    shutter: str = eqx.field(static=True)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return channels_of(self.cfa)
+
+    @property
+    def channel_index(self) -> np.ndarray:
+        """Channel of each pixel, [row, column]."""
+        tile = cfa_tile(self.cfa)
+        return np.tile(tile, (self.shape[0] // len(tile), self.shape[1] // len(tile)))
+
+    def per_pixel(self, values: PerChannel) -> PixelMap:
+        """Spread values [channel] over the pixels of their colour, [1, row, column]."""
+        tile = cfa_tile(self.cfa)
+        repeats = (self.shape[0] // len(tile), self.shape[1] // len(tile))
+        return jnp.tile(values[tile], repeats)[None]
+
+    def per_row(self, values: FrameRows) -> Frames:
+        """Spread values [frame, row, channel] along the columns of their colour, [frame, row, column]."""
+        tile = cfa_tile(self.cfa)
+        period = len(tile)
+        rows, columns = self.shape
+        cells = values.reshape(len(values), rows // period, period, len(self.channels))
+        pattern = cells[:, :, np.arange(period)[:, None], tile].reshape(len(values), rows, period)
+        return jnp.tile(pattern, (1, 1, columns // period))
+
+
+class AbstractEffect(eqx.Module):
+    """One physical effect. Subclasses are final: give `name`, `stage`, parameters by `param`, and `sample`.
+
+    What is not a physical parameter (a clipping level, a choice) is an `eqx.field(static=True)` that JSON can
+    hold.
+
+    Attributes:
+        name: name in tables and files, unique in a model; the effect's random key derives from it.
+        stage: where in the sensor it acts.
+    """
+
+    name: eqx.AbstractClassVar[str]
+    stage: eqx.AbstractClassVar[Stage]
+
+    @abc.abstractmethod
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:
+        """What leaves the effect, [frame, row, column], when `signal` enters it; in the unit of its stage."""
+
+    def __check_init__(self):
+        for field, spec in self.specs().items():
+            value = getattr(self, field)
+            if is_traced(value):
+                continue
+            low = -np.inf if spec.low is None else spec.low
+            high = np.inf if spec.high is None else spec.high
+            value = np.asarray(value)
+            if not np.all(np.isfinite(value) & (value >= low) & (value <= high)):
+                expected = f"finite values in [{low}, {high}] {spec.unit}"
+                raise ValueError(f"{self.name}.{field}: expected {expected}, got {value}.")
+
+    @classmethod
+    def specs(cls) -> dict[str, ParameterSpec]:
+        """Declared parameters: field name to declaration, in order."""
+        declared = {field.name: field.metadata.get("parameter") for field in dataclasses.fields(cls)}
+        return {name: spec for name, spec in declared.items() if spec is not None}
+
+    def settings(self) -> dict[str, Any]:
+        """Static fields, which are no physical parameters: field name to value."""
+        static = [field.name for field in dataclasses.fields(self) if field.metadata.get("static", False)]
+        return {name: getattr(self, name) for name in static}
+
+    def parameters(self, channels: tuple[str, ...]) -> list[Parameter]:
+        """All numbers of the effect with their names in tables, one for each channel where channels differ.
+
+        A parameter called `value` drops its name (`gain.R`); a mono sensor has no channel name (`gain`).
+        """
+        listed = []
+        for field, spec in self.specs().items():
+            name = self.name if field == "value" else f"{self.name}.{field}"
+            value = np.asarray(getattr(self, field))
+            if spec.per_channel and len(channels) > 1:
+                values = zip(channels, np.broadcast_to(value, len(channels)), strict=True)
+                listed += [Parameter(f"{name}.{channel}", shortest(v), spec) for channel, v in values]
+            else:
+                listed.append(Parameter(name, shortest(value.reshape(())), spec))
+        return listed
+
+
+def shortest(value: np.ndarray | np.floating) -> float:
+    """The number of fewest digits that reads back as `value` in its precision: 0.1, not 0.10000000149."""
+    return float(str(value))
+
+
+def draw_poisson(key: RandomKey, mean: Frames) -> Frames:
+    """Poisson counts of the given means, as floats; the one place where hsnoise draws them.
+
+    Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
+    """
+    return jax.random.poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)

@@ -1,0 +1,39 @@
+"""Analogue-to-digital converter."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._types import Counts, Frames, RandomKey
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+
+_LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
+
+
+class ADC(AbstractEffect):
+    """Counts: rounded to the nearest integer, clipped at 0 and at the white level if there is one.
+
+    Counts are uint16 when `white_level_dn` is at most 65535, else uint32: nothing wraps around.
+
+    Attributes:
+        white_level_dn: largest count, DN; None for no upper limit.
+    """
+
+    name: ClassVar[str] = "adc"
+    stage: ClassVar[Stage] = Stage.DIGITAL
+    white_level_dn: float | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        white = self.white_level_dn
+        if white is not None and not (0 < white <= _LARGEST_UINT32 and white == int(white)):
+            raise ValueError(f"adc.white_level_dn: expected a positive whole number or None, got {white!r}.")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Counts:
+        white = self.white_level_dn
+        high = _LARGEST_UINT32 if white is None else white
+        dtype = jnp.uint16 if high <= np.iinfo(np.uint16).max else jnp.uint32
+        return jnp.clip(jnp.round(signal), 0, high).astype(dtype)

@@ -1,0 +1,24 @@
+"""Dark current and its shot noise."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+
+
+class DarkCurrent(AbstractEffect):
+    """Dark electrons: Poisson(rate * exposure) in each pixel.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+
+    name: ClassVar[str] = "dark_current"
+    stage: ClassVar[Stage] = Stage.ELECTRONS
+    rate: Scalar = param("e-/s", low=0, doc="dark electrons of a pixel in a second")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        return signal + draw_poisson(key, jnp.full_like(signal, self.rate * capture.exposure_s))

@@ -1,0 +1,24 @@
+"""Noise of the readout circuit."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class ReadNoise(AbstractEffect):
+    """Read noise: Normal(0, sigma^2) in each pixel, referred to electrons.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+
+    name: ClassVar[str] = "read_noise"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation of the read noise")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        return signal + self.sigma * jax.random.normal(key, signal.shape, signal.dtype)

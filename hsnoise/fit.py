@@ -1,0 +1,162 @@
+"""`fit`: from dark frames (and flats) to a camera's parameters with honest standard errors."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise.coordinates import coordinates_for, labels
+from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise.line import line_fit
+from hsnoise.maximise import maximise
+from hsnoise.model import NoiseModel
+from hsnoise.moments import start_physics
+from hsnoise.notes import closing_notes, outlier_fraction
+from hsnoise.physics import Physics, physics_of
+from hsnoise.result import FitResult
+from hsnoise.stack import as_stack
+from hsnoise.statistics import Summary, summarise
+
+OUTLIERS_FROM = 1e-4
+METHODS = ("auto", "ml", "line")
+BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
+
+
+def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progress=None, **keywords) -> FitResult:
+    """Estimate all parameters of the paper's noise model jointly.
+
+    Args:
+        stack: FrameStack, a `Summary` of one, or an array [frame, row, column] or [exposure, frame, row, column]
+            with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...).
+        model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
+            not used. Default: all of the paper's.
+        method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "auto" is
+            "ml", and if that does not converge, "line", which the result then says.
+        progress: called with no argument after each frame that has been read.
+
+    Returns:
+        FitResult: `print` it for the table; `params` goes to `hsnoise.sample`.
+
+    Raises:
+        ValueError: for bad input, before any long work, and for effects that cannot be fitted.
+        RuntimeError: if method="ml" does not converge.
+
+    Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019; the
+    likelihood is derived in docs/likelihood.md.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    with_row_gain = model is None or _check_model(model)
+    summary = stack if isinstance(stack, Summary) else _summary_of(as_stack(stack, **keywords), progress)
+    if model is not None and (model.cfa, model.shutter) != (summary.cfa, summary.shutter):
+        raise ValueError(
+            f"model: made for {model.cfa}, {model.shutter} shutter; the stack is {summary.cfa}, {summary.shutter}"
+        )
+    if not summary.histograms and summary.black_level_dn is None:
+        raise ValueError(
+            "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
+        )
+    with jax.enable_x64(True):
+        start = start_physics(summary, with_row_gain)
+        if model is not None and "dark_current" not in model:
+            start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
+        if method == "line":
+            return _by_line(summary, model, "the paper's line fit, as asked")
+        result, converged = _by_likelihood(summary, model, start)
+        outside = outlier_fraction(result)
+        if (outside > OUTLIERS_FROM).any():
+            # Again, with a component for the pixels that follow no law of this model.
+            start = eqx.tree_at(
+                lambda p: p.outliers, start, np.clip(outside, OUTLIERS_FROM, 0.2), is_leaf=lambda x: x is None
+            )
+            result, converged = _by_likelihood(summary, model, start)
+        if converged:
+            return result
+        if method == "ml":
+            raise RuntimeError(f"fit: maximum likelihood did not converge: {result.outcome}")
+        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({result.outcome}); the line fit instead")
+
+
+def _summary_of(stack, progress) -> Summary:
+    stack.check()
+    return summarise(stack, progress)
+
+
+def _check_model(model: NoiseModel) -> bool:
+    """Whether it has a row gain. Raises ValueError for a model that cannot be fitted."""
+    missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
+    if missing:
+        raise ValueError(f"model: fit needs the effects {', '.join(missing)}")
+    physics_of(model)  # raises for effects without a likelihood
+    return "row_gain" in model
+
+
+def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, bool]:
+    coordinates = coordinates_for(summary, start)
+    maximum = maximise(coordinates, summary)
+    names = labels(coordinates, summary.channels)
+    covariance = _covariance(maximum.information)
+    kept = [i for i, name in enumerate(names) if not name.startswith("outliers")]  # shares of outliers are nuisances
+    result = FitResult(
+        params=_model_with(maximum.physics, summary, model),
+        physics=jax.tree.map(np.asarray, maximum.physics),
+        names=tuple(names[i] for i in kept),
+        covariance=covariance[np.ix_(kept, kept)],
+        method="ml",
+        outcome=("converged: " if maximum.converged else "NOT CONVERGED: ") + maximum.outcome,
+        iterations=maximum.iterations,
+        log_likelihood=maximum.log_likelihood,
+        notes=(),
+        summary=summary,
+    )
+    return result.with_notes(closing_notes(result)), maximum.converged
+
+
+def _by_line(summary: Summary, model, outcome: str) -> FitResult:
+    line = line_fit(summary)
+    coordinates = coordinates_for(summary, line.physics)
+    errors = np.asarray(coordinates.flat(jax.tree.map(jnp.asarray, line.standard_errors)))
+    result = FitResult(
+        params=_model_with(line.physics, summary, model),
+        physics=jax.tree.map(np.asarray, line.physics),
+        names=labels(coordinates, summary.channels),
+        covariance=np.diag(errors**2),
+        method="line",
+        outcome=outcome,
+        iterations=0,
+        log_likelihood=float("nan"),
+        notes=(),
+        summary=summary,
+    )
+    return result.with_notes((*line.notes, *closing_notes(result)))
+
+
+def _covariance(information: np.ndarray) -> np.ndarray:
+    """Inverse of the observed information; directions without any get a large, finite variance."""
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(information)), 1e-30))
+    eigenvalues, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    eigenvalues = np.maximum(eigenvalues, 1e-13)
+    return scale[:, None] * (vectors / eigenvalues) @ vectors.T * scale[None, :]
+
+
+def _model_with(physics: Physics, summary: Summary, model: NoiseModel | None) -> NoiseModel:
+    """A NoiseModel of the fitted values; its default exposure is the median one of the darks."""
+    values = {
+        "dark_current": lambda: DarkCurrent(physics.dark_current),
+        "read_noise": lambda: ReadNoise(physics.read_noise),
+        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent),
+        "gain": lambda: Gain(physics.gain),
+        "black_level": lambda: BlackLevel(physics.black_level),
+        "shot_noise": ShotNoise,
+        "adc": lambda: ADC(summary.white_level_dn),
+    }
+    names = [effect.name for effect in BASE_EFFECTS] if model is None else list(model.names)
+    exposures = summary.exposure_s if len(summary.exposure_s) else summary.flats.exposure_s
+    return NoiseModel(
+        [values[name]() for name in names],
+        cfa=summary.cfa,
+        shutter=summary.shutter,
+        exposure_s=float(np.sort(exposures)[len(exposures) // 2]),
+    )

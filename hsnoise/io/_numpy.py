@@ -1,0 +1,40 @@
+"""NumPy files: .npy memory-mapped, .npz loaded whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hsnoise.io._recording import Recording, naming, recordings
+
+EXPOSURE_FROM = "'exposure_s' in an .npz file"
+
+
+def read(path: Path) -> list[Recording]:
+    """Counts `[row, column]`, `[frame, row, column]` or `[exposure, frame, row, column]` of a NumPy file.
+
+    An .npy file is memory-mapped. An .npz file is compressed, so it is loaded whole; it holds `counts`, and
+    may hold exposure_s, kind, black_level, white_level, cfa, shutter, iso and temperature_c.
+
+    Raises:
+        ValueError: unreadable, truncated, or without counts of such a shape.
+    """
+    with naming(path):
+        if path.suffix.lower() == ".npy":
+            return recordings(path, _groups(np.load(path, mmap_mode="r")), {})
+        with path.open("rb") as file, np.load(file) as arrays:
+            if "counts" not in arrays:
+                raise ValueError(f"expected an array 'counts', got {sorted(arrays)}")
+            return recordings(path, _groups(arrays["counts"]), arrays)
+
+
+def _groups(counts: np.ndarray) -> list[np.ndarray]:
+    if counts.ndim not in (2, 3, 4):
+        raise ValueError(
+            "expected counts [row, column], [frame, row, column] or [exposure, frame, row, column], "
+            f"got shape {counts.shape}"
+        )
+    if counts.ndim == 4:
+        return list(counts)
+    return [counts if counts.ndim == 3 else counts[np.newaxis]]

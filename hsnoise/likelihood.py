@@ -1,0 +1,31 @@
+"""The public log-likelihood of a model, on a stack or its summary."""
+
+from __future__ import annotations
+
+import jax
+
+from hsnoise.model import NoiseModel
+from hsnoise.physics import Rules, evaluate, physics_of
+from hsnoise.plan import plan_rules
+from hsnoise.stack import as_stack
+from hsnoise.statistics import Summary, summarise
+
+
+def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **keywords) -> jax.Array:
+    """Log-likelihood (nats) of dark frames, and of flats if there are any, under `params`.
+
+    params: a NoiseModel; `jax.jit`, `jax.grad` and `jax.vmap` work over its leaves.
+    stack: a FrameStack, an array (with FrameStack's keywords), or the `Summary` that `summarise` made of it; make the
+        Summary once for many calls.
+    Computed in float64 whatever JAX's global setting. Rows with a coloured gain (shutter "rolling") are integrated by
+    the expectation-consistent approximation (rows.py), white rows exactly. Raises ValueError if the model's
+    channels or shutter are not the stack's, or if it holds effects without a likelihood.
+    """
+    summary = stack if isinstance(stack, Summary) else summarise(as_stack(stack, **keywords))
+    if params.channels != summary.channels:
+        raise ValueError(f"params: channels {params.channels}, but the stack has {summary.channels}")
+    if params.shutter != summary.shutter:
+        raise ValueError(f"params: shutter {params.shutter!r}, but the stack's is {summary.shutter!r}")
+    with jax.enable_x64(True):
+        physics = physics_of(params)
+        return evaluate(physics, summary, plan_rules(physics, summary) if rules is None else rules)

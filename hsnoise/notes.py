@@ -1,0 +1,145 @@
+"""Sentences on what a capture does not determine, and which capture would."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.physics import flat_variance
+from hsnoise.result import FitResult
+
+UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
+LEAST_OUTLIERS = 5  # pixels; fewer are chance
+MISPLACED_FRACTION = 0.03
+LIGHT_E_PER_S = 2e4  # a dark current above this looks like light
+
+
+def closing_notes(result: FitResult) -> tuple[str, ...]:
+    """All sentences that belong under the table of `result`."""
+    notes = [n for name, row in result.table.items() if (n := _note(name, row, result))]
+    misfit = _misfit_notes(result) if result.summary.histograms else _flat_notes(result)
+    return (*notes, *misfit, *_order_note(result), *_light_note(result))
+
+
+def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:
+    value, error, unit = row
+    parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
+    relative = error / max(abs(value), 1e-30)
+    if parameter == "gain" and relative > UNDETERMINED:
+        return f"{name} is not determined (standard error {error:.2g} {unit}): add flats, or darks of longer exposures."
+    if parameter == "read_noise.sigma" and relative > UNDETERMINED:
+        in_dn = value * float(np.mean(result.physics.gain))
+        return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
+    if parameter == "dark_current.rate":
+        return _dark_current_note(value, error, result)
+    # It is a variance that is estimated: its own error is 2 value x error.
+    if parameter == "row_gain.sigma" and value < 4 * error:
+        return f"{name} is compatible with zero (below {value + 2 * error:.2g})."
+    if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
+        return f"{name} is not determined: the row gain is too weak here to have a spectrum."
+    if parameter == "black_level" and name in result.names and error > 1.0:
+        return f"{name} is not determined ({error:.2g} DN): add bias frames (0 s), or give black_level."
+    return None
+
+
+def _dark_current_note(value: float, error: float, result: FitResult) -> str | None:
+    exposures = result.summary.exposure_s
+    if len(exposures) == 0:
+        return "dark_current.rate is not determined: add dark frames."
+    if not exposures.any():
+        return "dark_current.rate is not determined: all darks are bias frames of 0 s; add darks of seconds to minutes."
+    if value < 2 * error:
+        longest = max(exposures)
+        return (
+            f"dark_current.rate is compatible with zero (below {value + 2 * error:.2g} e-/s);"
+            f" darks longer than {longest:g} s would determine it."
+        )
+    return None
+
+
+def outlier_fraction(result: FitResult) -> np.ndarray:
+    """Fraction of the pixels of each dark exposure in bins where the model expects none."""
+    outside, total = np.zeros(1), np.ones(1)
+    for h, expected in zip(result.summary.histograms, result.expected_histograms(), strict=True):
+        measured = h.counts.sum((1, 2), dtype=np.float64)
+        outside = outside + np.where(expected < 0.01, measured, 0).sum(1)
+        total = total + measured.sum(1)
+    return np.where(outside < LEAST_OUTLIERS, 0.0, outside / total)
+
+
+def _misfit_notes(result: FitResult) -> list[str]:
+    """What the fitted histograms miss: outliers, and a shape that the model does not have."""
+    notes = []
+    outside = result.physics.outliers
+    if outside is not None:
+        e = int(outside.argmax())
+        notes.append(
+            f"{100 * outside[e]:.2g} % of the pixels at {result.summary.exposure_s[e]:g} s follow no law of this model"
+            " (hot pixels, cosmic hits, ...): they were set apart, and the model does not reproduce them."
+        )
+    for h, (law, deviation) in zip(result.summary.histograms, result.expected_laws(), strict=True):
+        e, misplaced, chance = _misplaced(h, law, deviation, result.summary)
+        if misplaced > MISPLACED_FRACTION + 3 * chance:
+            channel = "" if h.channel == "mono" else f" of channel {h.channel}"
+            exposure_s = result.summary.exposure_s[e]
+            notes.append(
+                f"The model misplaces {misplaced:.0%} of the pixels{channel} at {exposure_s:g} s: these frames hold an"
+                " effect that it lacks; read its parameters and standard errors with that in mind."
+            )
+            break
+    return notes + _flat_notes(result)
+
+
+def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int, float, float]:
+    """Exposure where the histogram is furthest off, what share of its pixels, and what chance alone would make."""
+    measured = h.counts.sum((1, 2), dtype=np.float64)
+    pixels = np.maximum(measured.sum(1, keepdims=True), 1)
+    share = 0.5 * np.abs(measured / pixels - law).sum(1)
+    rows = (h.row_pixels > 0).sum((1, 2))
+    # Coloured rows of a frame go together: count two independent ones a frame.
+    independent = rows if summary.shutter == "global" else 2 * np.asarray(summary.n_frames)
+    scatter = np.sqrt(deviation**2 / np.maximum(independent, 1)[:, None] + law / pixels)
+    chance = 0.5 * np.sqrt(2 / np.pi) * scatter.sum(1)
+    e = int((share - 3 * chance).argmax())
+    return e, float(share[e]), float(chance[e])
+
+
+def _flat_notes(result: FitResult) -> list[str]:
+    """Whether the flats follow the straight line of photon transfer."""
+    flats = result.summary.flats
+    if flats is None:
+        return []
+    expected = flat_variance(result.physics, flats)
+    excess = flats.variance_dn2 / expected - 1
+    z = excess * np.sqrt(flats.dof / 2)
+    if np.abs(z).max() < 5:
+        return []
+    return [
+        f"The variance of the flats leaves the photon transfer line by {excess.min():+.1%} to {excess.max():+.1%}"
+        f" (up to {np.abs(z).max():.0f} standard errors): the response bends or darks and flats disagree, and the gain"
+        " holds only on average."
+    ]
+
+
+def _order_note(result: FitResult) -> list[str]:
+    """Means that fall where the exposure grows."""
+    for h in result.summary.histograms:
+        order = np.argsort(result.summary.exposure_s, kind="stable")
+        level = h.row_sum.sum((1, 2))[order] / np.maximum(h.counts.sum((1, 2, 3), dtype=np.float64), 1)[order]
+        if (np.diff(level) < -1).any():
+            e = int(np.diff(level).argmin())
+            short, long = result.summary.exposure_s[order[[e, e + 1]]]
+            return [
+                f"The mean count falls by {level[e] - level[e + 1]:.3g} DN from {short:g} s to {long:g} s: are the"
+                " exposures right? If so, the camera subtracts its dark level, which this model does not describe."
+            ]
+    return []
+
+
+def _light_note(result: FitResult) -> list[str]:
+    rate = result.table.get("dark_current.rate", (0.0,))[0]
+    if rate < LIGHT_E_PER_S or not len(result.summary.exposure_s):
+        return []
+    return [
+        f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
+        " pass kind='flat'."
+    ]

@@ -1,0 +1,224 @@
+"""The exact likelihood of dark frames from their row histograms, and of flats from their photon transfer.
+
+P(y | beta) is a difference of the distribution function of Poisson(lambda) + Normal(0, sigma^2) at the edges of the
+count (the first and last bin take the tails); a row's curve over beta is its histogram times log P; rows.py
+integrates beta out. The cost after `summarise` does not depend on the number of pixels in a row.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise import rows
+from hsnoise._numerics import bin_probability, distribution, poisson_normal_law
+from hsnoise.model import NoiseModel
+from hsnoise.statistics import FlatMoments, Summary
+
+# Added to the probability of each bin: bounds the influence of a pixel that the model excludes (a cosmic hit), and
+# the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.
+FLOOR = 1e-10
+ROUNDING_VARIANCE = 1 / 12  # of rounding to whole counts, DN^2
+
+
+class Physics(eqx.Module):
+    """Parameters of the paper's model: gain [channel] DN/e-, dark current e-/s, read noise e-, row gain, black DN.
+
+    outliers [exposure]: fraction of pixels that follow no such law (hot pixels, cosmic hits) and may hold any count;
+    None for none. It keeps them from bending the estimates of all the others.
+    """
+
+    gain: jax.Array
+    dark_current: jax.Array
+    read_noise: jax.Array
+    row_sigma: jax.Array | None
+    exponent: jax.Array
+    black_level: jax.Array
+    outliers: jax.Array | None = None
+
+
+class Block(eqx.Module):
+    """Groups of rows that share a number of nodes: counts [part, group, row, bin], beta in low..high [part, group]."""
+
+    counts: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    nodes: int = eqx.field(static=True)
+
+
+class RowRule(eqx.Module):
+    """Rows sorted into groups of similar gain, and the quadrature that resolves them, for channels of one row_stride.
+
+    A part is one channel in one exposure, told by `channel` and `exposure` [part]; scale [part] spaces the nodes.
+    Without a row gain each part has one row, the sum of all, and there is no layout.
+    """
+
+    channel: np.ndarray
+    exposure: np.ndarray
+    blocks: tuple[Block, ...]
+    layout: rows.Layout | None
+    scale: np.ndarray
+    row_stride: int = eqx.field(static=True)
+
+
+Rules = tuple[RowRule, ...]
+
+
+def physics_of(model: NoiseModel) -> Physics:
+    """The base parameters of a model in float64. Raises ValueError for effects without a likelihood."""
+    known = {"shot_noise", "dark_current", "read_noise", "gain", "row_gain", "black_level", "adc"}
+    extra = [effect.name for effect in model.effects if effect.name not in known]
+    if extra:
+        raise ValueError(f"log_likelihood: effects {extra} do not state how they change the likelihood")
+    n = len(model.channels)
+
+    def f64(x):
+        return jnp.asarray(x, jnp.float64)
+
+    row_gain = model["row_gain"] if "row_gain" in model else None
+    return Physics(
+        gain=f64(model["gain"].value),
+        dark_current=f64(model["dark_current"].rate) if "dark_current" in model else f64(0.0),
+        read_noise=f64(model["read_noise"].sigma),
+        row_sigma=None if row_gain is None else f64(row_gain.sigma),
+        exponent=f64(0.0) if row_gain is None else f64(row_gain.exponent),
+        black_level=f64(model["black_level"].value) if "black_level" in model else jnp.zeros(n, jnp.float64),
+    )
+
+
+def evaluate(physics: Physics, summary: Summary, rules: Rules) -> jax.Array:
+    """Log-likelihood in float64 (enabled by the caller)."""
+    total = jnp.zeros((), jnp.float64)
+    if summary.histograms:
+        laws = dark_laws(jax.lax.stop_gradient(physics), summary.exposure_s)
+        for rule in rules:
+            total += rows_log_likelihood(physics, rule, laws, summary)
+    if summary.flats is not None:
+        total += flat_log_likelihood(physics, summary)
+    return total
+
+
+def dark_laws(physics: Physics, exposure_s):
+    """Law of the electrons of each exposure: shared by all channels, gains and black levels."""
+    mean_e = physics.dark_current * jnp.asarray(exposure_s)
+    return jax.vmap(poisson_normal_law, (0, None))(mean_e, physics.read_noise)
+
+
+def rows_log_likelihood(physics: Physics, rule: RowRule, laws, summary: Summary) -> jax.Array:
+    """Log-likelihood of the rows of a rule's channels in all exposures."""
+
+    def part(physics, inputs):
+        at, blocks, layout, scale = inputs
+        if physics.row_sigma is None:
+            return (blocks[0].counts[0, 0] * log_probability(physics, at, jnp.ones(1))[0]).sum()
+        sigma = physics.row_sigma[at.channel]
+        curves = []
+        for block in blocks:
+            nodes = rows.make_nodes(block.low, block.high, scale, sigma, block.nodes)
+            table = log_probability(physics, at, nodes.beta.ravel()).reshape(*nodes.beta.shape, -1)
+            curves.append((jnp.einsum("grb,gnb->grn", block.counts.astype(table.dtype), table), nodes))
+        of_rows = rows.Curves(tuple(curves), layout)
+        if summary.shutter == "global":
+            return rows.log_evidence_white(of_rows, sigma**2)
+        spectrum = rows.row_spectrum(physics.exponent, summary.shape[0], rule.row_stride, sigma.dtype)
+        return rows.log_evidence_coloured(of_rows, sigma**2 * spectrum).sum()
+
+    at = binning(summary, laws, rule.channel, rule.exposure)
+    return _sum_with_gradient(part, physics, jax.tree.map(jnp.asarray, (at, rule.blocks, rule.layout, rule.scale)))
+
+
+class Binning(NamedTuple):
+    """What the probabilities of a part's bins stand on: channel, exposure, seconds, law of the electrons, edges."""
+
+    channel: jax.Array
+    exposure: jax.Array
+    exposure_s: jax.Array
+    law: tuple
+    edges_dn: jax.Array
+    outlier_law: jax.Array
+
+
+def binning(summary: Summary, laws, channel, exposure) -> Binning:
+    """The Binning of parts, given by their channels and exposures [part], with a leading axis for the parts."""
+    edges, outlier = (
+        jnp.stack([jnp.asarray(getattr(h, name)) for h in summary.histograms]) for name in ("edges_dn", "outlier_law")
+    )
+    channel, exposure = jnp.asarray(channel), jnp.asarray(exposure)
+    law = jax.tree.map(lambda x: x[exposure], laws)
+    seconds = jnp.asarray(summary.exposure_s)[exposure]
+    return Binning(channel, exposure, seconds, law, edges[channel, exposure], outlier[channel, exposure])
+
+
+def _sum_with_gradient(function, physics: Physics, inputs):
+    """Sum of function(physics, inputs[i]) over the parts i, one at a time.
+
+    Its gradient is made together with its value, part by part, so that memory and compilation are those of one part.
+    The price: only first derivatives, in reverse mode (those of coloured rows would be wrong beyond).
+    """
+
+    @jax.custom_vjp
+    def total(physics, inputs):
+        return jax.lax.map(lambda x: function(physics, x), inputs).sum()
+
+    def forward(physics, inputs):
+        values, gradients = jax.lax.map(lambda x: jax.value_and_grad(function)(physics, x), inputs)
+        return values.sum(), jax.tree.map(lambda g: g.sum(0), gradients)
+
+    def backward(gradient, cotangent):
+        return jax.tree.map(lambda g: cotangent * g, gradient), None
+
+    total.defvjp(forward, backward)
+    return total(physics, inputs)
+
+
+def log_probability(physics: Physics, at: Binning, beta):
+    """log P(bin | beta) of one part: [node, bin] for beta [node]."""
+    scale = physics.gain[at.channel] * jnp.maximum(beta, 1e-6)
+    edges_e = (at.edges_dn - physics.black_level[at.channel])[None, :] / scale[:, None]
+    mean_e = physics.dark_current * at.exposure_s
+    table = jnp.log(bin_probability(*distribution(0, edges_e, mean_e, physics.read_noise, at.law)) + FLOOR)
+    if physics.outliers is None:
+        return table
+    share = physics.outliers[at.exposure]
+    return jnp.logaddexp(table + jnp.log1p(-share), jnp.log(share * at.outlier_law + FLOOR)[None, :])
+
+
+def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
+    """Photon transfer of flats: temporal variance against mean, and row power. Light levels are profiled out.
+
+    variance = gain^2 (light + read_noise^2) (1 + row_sigma^2) + 1/12; the light of a level is what its mean says, and
+    where the photons are known the mean itself counts (EMVA 1288 release 4, section 6).
+    """
+    flats = summary.flats
+    gain, black = physics.gain[None, :], physics.black_level[None, :]
+    row_variance = jnp.zeros_like(gain) if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
+    signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
+    variance = flat_variance(physics, flats)
+    total = _gamma_log_density(flats.variance_dn2, flats.dof, variance).sum()
+    row_power = row_variance * signal**2 + variance / jnp.asarray(flats.row_pixels)
+    total += _gamma_log_density(flats.row_power_dn2, flats.row_dof, row_power).sum()
+    if flats.photons_e is not None:
+        photons = jnp.nan_to_num(jnp.asarray(flats.photons_e))[:, None]
+        dark = physics.dark_current * jnp.asarray(flats.exposure_s)[:, None]
+        residual = jnp.asarray(flats.mean_dn) - black - gain * (photons + dark)
+        mean_variance = row_power / (jnp.asarray(flats.row_dof) + 1)
+        known = jnp.isfinite(jnp.asarray(flats.photons_e))[:, None]
+        total += jnp.where(known, -0.5 * residual**2 / mean_variance - 0.5 * jnp.log(mean_variance), 0.0).sum()
+    return total
+
+
+def flat_variance(physics: Physics, flats: FlatMoments):
+    """Expected temporal variance within rows [level, channel], DN^2: the photon transfer line."""
+    gain, black = physics.gain[None, :], physics.black_level[None, :]
+    row_variance = 0.0 if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
+    signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
+    return (gain * signal + (gain * physics.read_noise) ** 2) * (1 + row_variance) + ROUNDING_VARIANCE
+
+
+def _gamma_log_density(measured, dof, expected):
+    """Log density of a mean square with `dof` degrees of freedom, up to a constant."""
+    return -0.5 * jnp.asarray(dof) * (jnp.log(expected) + jnp.asarray(measured) / expected)

@@ -1,0 +1,9 @@
+"""Figures of a fit. Each function returns a `matplotlib.figure.Figure`; pyplot and its global state are not used."""
+
+from __future__ import annotations
+
+from hsnoise.plots._histograms import histograms
+from hsnoise.plots._photon_transfer import photon_transfer
+from hsnoise.plots._row_spectrum import row_spectrum
+
+__all__ = ["histograms", "photon_transfer", "row_spectrum"]

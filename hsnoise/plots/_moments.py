@@ -1,0 +1,35 @@
+"""What the fitted model expects of the mean and the variance of counts, clipping and rounding included."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.lut import clipped_moments
+from hsnoise.physics import Physics
+
+BETA_NODES = 32
+LEAST_BETA = 1e-6
+
+
+def beta_rule(sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights [beta] of the row gain Normal(1, sigma^2)."""
+    z, weight = np.polynomial.hermite_e.hermegauss(BETA_NODES)
+    return 1 + sigma * z, weight / weight.sum()
+
+
+def count_moments(physics: Physics, c: int, exposure_s, beta, white_level_dn: float | None):
+    """Mean above black (DN) and variance (DN^2) of a pixel's count, [exposure, beta], for channel number `c`.
+
+    exposure_s [exposure] in s; beta [beta], gains below zero count as zero. Counts are rounded, and clipped at 0
+    and at the white level.
+    """
+    gain = float(physics.gain[c]) * np.maximum(np.asarray(beta)[None, :], LEAST_BETA)
+    mean_e = float(physics.dark_current) * np.asarray(exposure_s)[:, None]
+    mean, variance = clipped_moments(
+        gain * mean_e,
+        gain**2 * (mean_e + float(physics.read_noise) ** 2),
+        gain=gain + 0 * mean_e,
+        black_level_dn=float(physics.black_level[c]),
+        white_level_dn=white_level_dn,
+    )
+    return np.asarray(mean), np.asarray(variance)

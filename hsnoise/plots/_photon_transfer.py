@@ -1,0 +1,133 @@
+"""Mean-variance relation of a fit."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hsnoise.physics import ROUNDING_VARIANCE, Physics
+from hsnoise.plots._moments import beta_rule, count_moments
+from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy
+from hsnoise.statistics import RowHistograms, Summary
+
+CLIPPED_FRACTION = 1e-3
+CURVE_POINTS = 40
+
+
+def photon_transfer(fit) -> Figure:
+    """Variance against mean of the counts, measured and fitted: the photon transfer curve.
+
+    Darks: one point per exposure and colour, its variance taken within rows, so that row offsets and the spread
+    of row gains between rows do not enter. Flats: one point per level and colour, temporal variance within
+    rows. Solid: what the fitted model expects of the recorded counts; dashed, where clipping matters: what the
+    sensor delivered before it was clipped. Hollow points: more than 0.1 % of the pixels are clipped.
+
+    Args:
+        fit: result of `hsnoise.fit`.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+    summary, physics = fit.summary, fit.physics
+    panels = [draw for draw, there in ((_darks, summary.histograms), (_flats, summary.flats is not None)) if there]
+    figure = new_figure(6.4 * len(panels), 5.0, "Photon transfer: variance against mean of the counts")
+    for axes, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        draw(axes, physics, summary)
+        axes.set_xlabel("mean above black level / DN")
+        axes.set_ylabel("variance within rows / DN²")
+        tidy(axes)
+    return figure
+
+
+def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
+    axes.set_title("dark frames, one point per exposure", fontsize=10)
+    t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
+    any_clipped = False
+    for c, histograms in enumerate(summary.histograms):
+        channel, black = histograms.channel, float(physics.black_level[c])
+        colour = COLOURS[channel]
+        mean, variance, error = _within_rows(histograms)
+        clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION
+        _points(axes, channel, mean - black, variance, clipped, error)
+        x, y = _expected(physics, c, t, summary.white_level_dn)
+        axes.plot(x, y, linewidth=1.6, color=colour)
+        if clipped.any():
+            any_clipped = True
+            axes.plot(*_unclipped(physics, c, t), "--", linewidth=1.2, color=colour)
+    axes.plot([], [], "-", color="0.3", label="fitted model")
+    if any_clipped:
+        axes.plot([], [], "--", color="0.3", label="fitted, before clipping")
+        axes.plot([], [], "o", mfc="white", mec="0.3", label="more than 0.1 % clipped")
+    axes.set_ylim(0, 1.15 * axes.dataLim.y1)
+    axes.legend(fontsize=9, framealpha=0.9)
+
+
+def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
+    axes.set_title("flat frames, one point per level", fontsize=10)
+    flats = summary.flats
+    white = np.inf if summary.white_level_dn is None else summary.white_level_dn
+    for c, channel in enumerate(summary.channels):
+        black = float(physics.black_level[c])
+        signal, variance = flats.mean_dn[:, c] - black, flats.variance_dn2[:, c]
+        clipped = (flats.mean_dn[:, c] + 3 * np.sqrt(variance) > white) | (flats.mean_dn[:, c] < 3 * np.sqrt(variance))
+        _points(axes, channel, signal, variance, clipped, variance * np.sqrt(2 / flats.dof[:, c]))
+        positive = signal[signal > 0]
+        if len(positive):
+            light_dn = np.geomspace(positive.min() / 2, positive.max() * 1.5, CURVE_POINTS)
+            axes.plot(light_dn, _line(physics, c, light_dn), color=COLOURS[channel], linewidth=1.6)
+    axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.legend(fontsize=9, framealpha=0.9)
+
+
+def _points(axes: Axes, channel: str, x, y, clipped, error) -> None:
+    colour = COLOURS[channel]
+    axes.errorbar(x, y, error, fmt="none", ecolor=colour, elinewidth=1.2, capsize=3, zorder=3)
+    faces = ["white" if one else colour for one in clipped]
+    axes.scatter(x, y, s=46, marker=MARKERS[channel], c=faces, edgecolors=colour, linewidths=1.5, zorder=4)
+    axes.plot([], [], MARKERS[channel], color=colour, label=NAMES[channel])
+
+
+def _within_rows(histograms: RowHistograms):
+    """Mean (DN), variance within rows (DN^2) and its standard error over frames, each [exposure]."""
+    pixels = histograms.row_pixels  # [exposure, frame, row]; 0 in padding
+    used = pixels[..., 0] > 0
+    n = np.maximum(pixels, 2)
+    row_variance = (histograms.row_sum_of_squares - histograms.row_sum**2 / n) / (n - 1)
+    frames = used.sum(1)
+    mean = histograms.row_sum.sum((1, 2)) / pixels.sum((1, 2))
+    of_frame = [row_variance[e][used[e]].mean(1) for e in range(len(used))]
+    variance = np.array([one.mean() for one in of_frame])
+    spread = [one.std(ddof=1) if len(one) > 1 else np.nan for one in of_frame]
+    return mean, variance, np.array(spread) / np.sqrt(frames)
+
+
+def clipped_fraction(histograms: RowHistograms, white_level_dn: float | None) -> np.ndarray:
+    """Fraction [exposure] of pixels at 0 or at the white level."""
+    counts = histograms.counts.sum((1, 2), dtype=np.float64)
+    at_zero = np.where(histograms.edges_dn[:, 0] <= 0.5, counts[:, 0], 0.0)
+    reaches_white = white_level_dn is not None and histograms.edges_dn[:, -1] >= white_level_dn - 0.5
+    return (at_zero + np.where(reaches_white, counts[:, -1], 0.0)) / counts.sum(1)
+
+
+def _expected(physics: Physics, c: int, exposure_s, white_level_dn: float | None):
+    """Mean above black and variance within rows of the recorded counts, averaged over the row gain; [exposure]."""
+    beta, weight = beta_rule(_row_sigma(physics, c))
+    mean, variance = count_moments(physics, c, exposure_s, beta, white_level_dn)
+    return mean @ weight, variance @ weight
+
+
+def _unclipped(physics: Physics, c: int, exposure_s):
+    """Mean above black and variance within rows of counts that nothing clips."""
+    signal = float(physics.gain[c]) * float(physics.dark_current) * exposure_s
+    return signal, _line(physics, c, signal)
+
+
+def _line(physics: Physics, c: int, signal_dn):
+    gain, read_noise_e = float(physics.gain[c]), float(physics.read_noise)
+    return (gain * signal_dn + (gain * read_noise_e) ** 2) * (1 + _row_sigma(physics, c) ** 2) + ROUNDING_VARIANCE
+
+
+def _row_sigma(physics: Physics, c: int) -> float:
+    return 0.0 if physics.row_sigma is None else float(physics.row_sigma[c])

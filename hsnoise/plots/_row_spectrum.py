@@ -1,0 +1,122 @@
+"""Spectrum of the row gain of a fit."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hsnoise import rows
+from hsnoise.physics import Physics
+from hsnoise.plots._moments import beta_rule, count_moments
+from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, seconds, tidy
+from hsnoise.statistics import RowHistograms, Summary
+
+BANDS_PER_OCTAVE = 3
+SMALLEST_SIGMA = 1e-6
+LARGEST_RANGE = 1e6  # a row gain further below the measurement is off the figure
+LEGEND = ("measured", "measured, in bands", "fitted: gain + pixel noise", "row gain alone", "pixel noise alone")
+
+
+def row_spectrum(fit) -> Figure:
+    """Power spectrum of the row gain along the rows, measured and fitted, log-log; one panel per colour.
+
+    Measured: the periodogram of row means, divided by how strongly the mean of a row depends on its gain, averaged
+    over the frames of the exposure that shows the row gain best. Fitted: row gain plus what the noise of the
+    pixels leaves in a row mean. Power is normalised so that its mean over all frequencies is the variance over rows.
+
+    Args:
+        fit: result of `hsnoise.fit`, of a stack with dark frames.
+
+    Raises:
+        ValueError: there are no dark frames or no row gain in the model.
+
+    Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019, Fig. 3.
+    """
+    summary, physics = fit.summary, fit.physics
+    if not summary.histograms or physics.row_sigma is None:
+        missing = "dark frames in the stack" if not summary.histograms else "row_gain in the model"
+        raise ValueError(f"fit: a row spectrum needs {missing}, and there is none")
+    channels = len(summary.histograms)
+    figure = new_figure(max(4.3 * channels, 6.4), 4.6, "Spectrum of the row gain")
+    panels = figure.subplots(1, channels, squeeze=False, sharey=True)[0]
+    for c, (axes, histograms) in enumerate(zip(panels, summary.histograms, strict=True)):
+        _panel(axes, physics, c, histograms, summary)
+    low, high = min(one.dataLim.y0 for one in panels), max(one.dataLim.y1 for one in panels)
+    panels[0].set_ylim(0.5 * max(low, high / LARGEST_RANGE), 2 * high)
+    panels[0].set_ylabel("power of the row gain β (variance per row)")
+    entries = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
+    order = [entries[label] for label in LEGEND]
+    figure.legend(order, LEGEND, loc="outside lower center", ncols=min(len(LEGEND), 2 * channels + 1), fontsize=9)
+    return figure
+
+
+def _panel(axes: Axes, physics: Physics, c: int, histograms: RowHistograms, summary: Summary) -> None:
+    slope, noise = _response(physics, c, histograms, summary)
+    e = int(np.argmax(slope**2 / noise))
+    row_mean = _row_means(histograms, e)
+    frames, n_rows = row_mean.shape
+    k = np.arange(1, n_rows // 2 + 1)
+    power = (np.abs(np.fft.rfft(row_mean, axis=1)) ** 2).mean(0)[1:] / n_rows / slope[e] ** 2
+    floor = noise[e] / slope[e] ** 2
+    sigma = max(float(physics.row_sigma[c]), SMALLEST_SIGMA)
+    fitted = sigma**2 * _shape(physics, summary, histograms)[k]
+    colour, channel = COLOURS[histograms.channel], histograms.channel
+    axes.loglog(k, power, ".", color=colour, alpha=0.35, markersize=4, label="measured")
+    x, y, error = _bands(k, power, frames)
+    axes.errorbar(
+        x,
+        y,
+        error,
+        fmt=MARKERS[channel],
+        color=colour,
+        markersize=7,
+        mec="white",
+        capsize=3,
+        label="measured, in bands",
+    )
+    axes.plot(k, fitted + floor, color=FIT, linewidth=1.8, label="fitted: gain + pixel noise")
+    axes.plot(k, fitted, "--", color=FIT, linewidth=1.2, label="row gain alone")
+    axes.plot(k, np.full(len(k), floor), ":", color="0.5", linewidth=1.8, label="pixel noise alone")
+    axes.set_title(f"{NAMES[channel]}, {_count(frames)} of {seconds(summary.exposure_s[e])}", fontsize=10)
+    axes.set_xlabel("row frequency / cycles per frame height")
+    tidy(axes)
+
+
+def _count(frames: int) -> str:
+    return f"{frames} dark frame{'s' if frames > 1 else ''}"
+
+
+def _response(physics: Physics, c: int, histograms: RowHistograms, summary: Summary):
+    """Change of a row's mean with its gain (DN) and variance of a row mean from its pixels (DN^2): [exposure]."""
+    sigma = max(float(physics.row_sigma[c]), 1e-3)
+    beta, weight = beta_rule(sigma)
+    mean, variance = count_moments(physics, c, summary.exposure_s, beta, summary.white_level_dn)
+    slope = mean @ (weight * (beta - 1)) / sigma**2
+    return slope, variance @ weight / histograms.row_pixels.max((1, 2))
+
+
+def _row_means(histograms: RowHistograms, exposure: int) -> np.ndarray:
+    pixels = histograms.row_pixels[exposure]
+    used = pixels[:, 0] > 0
+    return histograms.row_sum[exposure][used] / pixels[used]
+
+
+def _shape(physics: Physics, summary: Summary, histograms: RowHistograms) -> np.ndarray:
+    """Spectrum of unit variance of the colour's rows, [row]."""
+    n_rows = histograms.row_sum.shape[2]
+    if summary.shutter == "global":
+        return np.ones(n_rows)
+    with jax.enable_x64(True):
+        sensor_rows = n_rows * histograms.row_stride
+        return np.asarray(rows.row_spectrum(float(physics.exponent), sensor_rows, histograms.row_stride, np.float64))
+
+
+def _bands(k: np.ndarray, power: np.ndarray, frames: int):
+    """Centre, mean power and its standard error in logarithmic bands; a periodogram is exponentially distributed."""
+    band = np.round(BANDS_PER_OCTAVE * np.log2(k)).astype(int)
+    _, band = np.unique(band, return_inverse=True)
+    n = np.bincount(band)
+    y = np.bincount(band, power) / n
+    return np.exp(np.bincount(band, np.log(k)) / n), y, y / np.sqrt(n * frames)

@@ -1,0 +1,36 @@
+"""Colours, markers and figures that all plots share."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito's palette: told apart with any colour vision; the markers tell channels apart without colour.
+COLOURS = {"R": "#D55E00", "G": "#009E73", "B": "#0072B2", "mono": "#404040"}
+MARKERS = {"R": "o", "G": "s", "B": "^", "mono": "o"}
+NAMES = {"R": "red", "G": "green", "B": "blue", "mono": "all pixels"}
+FIT = "black"
+DPI = 110
+
+
+def new_figure(width_in: float, height_in: float, title: str) -> Figure:
+    """An empty figure whose parts make room for each other."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    figure.suptitle(title, fontsize=12)
+    return figure
+
+
+def tidy(axes: Axes) -> None:
+    """A light grid behind the data, no frame above and on the right."""
+    axes.grid(True, which="major", color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+
+
+def seconds(exposure_s: float) -> str:
+    """An exposure for a label: 25 us, 50 ms, 1.5 s."""
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
+        if exposure_s * factor >= 1:
+            return f"{exposure_s * factor:.4g} {unit}"
+    return f"{exposure_s:g} s"

@@ -1,0 +1,127 @@
+"""What a fit returns: parameters, standard errors, and how it went."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise import rows
+from hsnoise.model import NoiseModel
+from hsnoise.physics import Physics, binning, dark_laws, log_probability
+from hsnoise.statistics import Summary, without_counts
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted camera.
+
+    Attributes:
+        params: the NoiseModel, for `hsnoise.sample`, `save`, ...
+        names, covariance: fitted parameters and their covariance, in the units of `table`.
+        method: "ml" or "line".
+        outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
+        log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
+        notes: sentences on what the data do not determine, and which capture would.
+        summary: the row histograms and photon transfer that were fitted.
+        physics: the same parameters as `hsnoise.physics` takes them.
+    """
+
+    params: NoiseModel
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    method: str
+    outcome: str
+    iterations: int
+    log_likelihood: float
+    notes: tuple[str, ...]
+    summary: Summary
+    physics: Physics
+
+    @property
+    def table(self) -> dict[str, tuple[float, float, str]]:
+        """Parameter name to (value, standard error, unit); the error is 0 for a value that was given, not fitted,
+        and infinite where the capture says nothing."""
+        fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
+        rows_ = {}
+        for name, (value, unit) in self.params.table().items():
+            error = float(fitted.get(name, np.inf if name == "dark_current.rate" else 0.0))
+            rows_[name] = (value, error, unit)
+        return rows_
+
+    def with_notes(self, notes: tuple[str, ...]) -> FitResult:
+        return replace(self, notes=notes)
+
+    def expected_histograms(self) -> tuple[np.ndarray, ...]:
+        """Counts that the model expects in the bins of `summary.histograms`: for each channel [exposure, bin]."""
+        return tuple(
+            law * h.row_pixels.sum((1, 2))[:, None]
+            for h, (law, _) in zip(self.summary.histograms, self.expected_laws(), strict=True)
+        )
+
+    def expected_laws(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each channel [exposure, bin]: probability of a bin over all row gains, and its deviation between rows."""
+        with jax.enable_x64(True):
+            physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self.physics)
+            light = without_counts(self.summary)
+            return [jax.tree.map(np.asarray, _expected(physics, c, light)) for c in range(len(self.summary.histograms))]
+
+    def __str__(self) -> str:
+        darks = f"{sum(self.summary.n_frames)} dark frames at {len(self.summary.exposure_s)} exposures"
+        flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
+        title = {"ml": "Joint maximum likelihood", "line": "Line fit"}[self.method]
+        table = Table()
+        for heading in ("parameter", "value", "standard error", "unit"):
+            table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+        for name, (value, error, unit) in self.table.items():
+            table.add_row(name, _digits(value, error), _error(name, error, self.names), unit)
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(f"{title}: {darks}{flats}", highlight=False)
+        console.print(table)
+        console.print(f"{self.outcome}; {self.iterations} iterations", highlight=False)
+        for note in self.notes:
+            console.print(f"- {note}", highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+
+@jax.jit
+def _expected(physics: Physics, c: int, summary: Summary) -> tuple[jax.Array, jax.Array]:
+    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin]."""
+    beta, weight = jnp.ones(1), jnp.ones(1)
+    if physics.row_sigma is not None:
+        sigma = jnp.maximum(physics.row_sigma[c], 1e-6)
+        nodes = rows.make_nodes(jnp.zeros(1), (1 + rows.PRIOR_REACH * sigma)[None], 0.1, sigma, 256)
+        beta, density = nodes.beta[0], jax.scipy.stats.norm.pdf(nodes.beta[0], 1.0, sigma)
+        weight = jnp.exp(nodes.log_weight[0]) * density
+        weight = weight.at[0].add(jax.scipy.stats.norm.cdf((beta[0] - 1) / sigma))
+
+    def exposure(at):
+        law = jnp.exp(log_probability(physics, at, beta))
+        share = weight / weight.sum()
+        mixed = share @ law
+        return mixed / mixed.sum(), jnp.sqrt(share @ (law - mixed[None, :]) ** 2)
+
+    exposures = len(summary.exposure_s)
+    laws = dark_laws(physics, summary.exposure_s)
+    return jax.lax.map(exposure, binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures)))
+
+
+def _digits(value: float, error: float) -> str:
+    """The value to the second digit of its error."""
+    if not np.isfinite(error) or error <= 0:
+        return f"{value:.5g}"
+    places = int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
+    return f"{value:.{places}f}"
+
+
+def _error(name: str, error: float, fitted: tuple[str, ...]) -> str:
+    if name not in fitted:
+        return "given" if error == 0 else "not determined"
+    return "not determined" if not np.isfinite(error) else f"{error:.2g}"

@@ -1,0 +1,299 @@
+"""Summaries of a stack in one pass over its pixels: row histograms of darks, photon transfer of flats.
+
+Both are additive and their size does not depend on the width of the sensor. Given the row gain, the pixels of one row
+and colour are independent draws from one law, so that their histogram is sufficient (darks). Flats have a fixed
+pattern of light: their frame-to-frame differences are used (Janesick, *Photon Transfer*, 2007; EMVA 1288).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+
+from hsnoise._frames import channel_planes
+from hsnoise._types import channels_of
+from hsnoise.stack import FrameStack
+
+BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
+RANGE_SIGMAS = 10.0
+MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
+FLICKER = 0.5  # of the mean: more is another light
+OUTLIER_SCALE = 2.0
+SAMPLE_PIXELS = 200_000
+
+
+class RowHistograms(eqx.Module):
+    """Histograms of one colour's rows in all dark exposures.
+
+    counts [exposure, frame, row, bin], padded with empty frames; bin j holds the counts between
+    edges_dn[exposure, j - 1] and edges_dn[exposure, j], the first and last bin all that lies outside.
+    row_sum, row_sum_of_squares [exposure, frame, row] in DN, DN^2 are exact, not binned. outlier_law [exposure, bin]
+    is how hot pixels and cosmic hits would spread over the bins: see `_outlier_law`.
+    """
+
+    counts: np.ndarray
+    edges_dn: np.ndarray
+    row_sum: np.ndarray
+    row_sum_of_squares: np.ndarray
+    outlier_law: np.ndarray
+    channel: str = eqx.field(static=True)
+    row_stride: int = eqx.field(static=True)
+
+    @property
+    def row_pixels(self) -> np.ndarray:
+        """Pixels in each row [exposure, frame, row]; 0 in frames that are padding."""
+        return self.counts.sum(-1, dtype=np.float64)
+
+
+class FlatMoments(eqx.Module):
+    """Photon transfer of the flats: [level, channel] mean, temporal variance within rows, degrees of freedom.
+
+    `row_power` is the mean square of row means of frame differences over 2, `row_dof` its degrees of freedom.
+    """
+
+    exposure_s: np.ndarray
+    mean_dn: np.ndarray
+    variance_dn2: np.ndarray
+    dof: np.ndarray
+    row_power_dn2: np.ndarray
+    row_dof: np.ndarray
+    row_pixels: np.ndarray
+    photons_e: np.ndarray | None
+
+
+class Summary(eqx.Module):
+    """All that the likelihood and the line fit need of a capture. Made by `summarise`."""
+
+    exposure_s: np.ndarray
+    histograms: tuple[RowHistograms, ...]
+    flats: FlatMoments | None
+    black_level_dn: np.ndarray | None
+    white_level_dn: float | None = eqx.field(static=True)
+    cfa: str = eqx.field(static=True)
+    shutter: str = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True)
+    n_frames: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return channels_of(self.cfa)
+
+
+def channel_rows(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
+    """Pixels of a channel as [colour row, pixel]: R and B every second sensor row, G all of them."""
+    if cfa == "mono":
+        return frame
+    planes = channel_planes(cfa, channel)
+    if len(planes) == 1:
+        (r, c) = planes[0]
+        return frame[r::2, c::2]
+    rows = np.empty((frame.shape[0], frame.shape[1] // 2), frame.dtype)
+    for r, c in planes:
+        rows[r::2] = frame[r::2, c::2]
+    return rows
+
+
+def round_up(size: int) -> int:
+    """The next of few sizes (16, 24, 32, 48, 64, 96 ...), so that captures alike share compiled programs."""
+    power = 1 << max(size - 1, 31).bit_length() - 1
+    return next(n for n in (power, power * 3 // 2, power * 2) if n >= size)
+
+
+def row_stride(cfa: str, channel: str) -> int:
+    return 1 if cfa == "mono" or len(channel_planes(cfa, channel)) == 2 else 2
+
+
+def first_frames(summary: Summary, frames: int) -> Summary:
+    """The summary of the first `frames` frames of each dark exposure (and of all flats)."""
+
+    def cut(h: RowHistograms) -> RowHistograms:
+        parts = {name: getattr(h, name)[:, :frames] for name in ("counts", "row_sum", "row_sum_of_squares")}
+        return replace(h, **parts)
+
+    n_frames = tuple(min(n, frames) for n in summary.n_frames)
+    return replace(summary, histograms=tuple(map(cut, summary.histograms)), n_frames=n_frames)
+
+
+def without_counts(summary: Summary) -> Summary:
+    """What the likelihood needs beside the sorted rows of its rules."""
+    empty = {"counts": None, "row_sum": None, "row_sum_of_squares": None}
+    return replace(summary, histograms=tuple(replace(h, **empty) for h in summary.histograms))
+
+
+def summarise(stack: FrameStack, progress=None) -> Summary:
+    """One pass over the pixels of `stack`: its row histograms (darks) and photon transfer (flats).
+
+    progress: called with no argument after each frame. Raises ValueError for frames that cannot be measured
+    (NaN, constant, all zero, saturated) and where nothing is left to fit.
+    """
+    tick = progress or (lambda: None)
+    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
+    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
+    return Summary(
+        exposure_s=np.asarray([stack.exposure_s[i] for i in darks], np.float64),
+        histograms=_row_histograms(stack, darks, tick) if darks else (),
+        flats=_flat_moments(stack, flats, tick) if flats else None,
+        black_level_dn=_black_per_channel(stack),
+        white_level_dn=stack.white_level,
+        cfa=stack.cfa,
+        shutter=stack.shutter,
+        shape=stack.shape,
+        n_frames=tuple(stack.n_frames[i] for i in darks),
+    )
+
+
+def _black_per_channel(stack: FrameStack) -> np.ndarray | None:
+    if stack.black_level is None:
+        return None
+    return np.broadcast_to(np.asarray(stack.black_level, np.float64), (len(stack.channels),)).copy()
+
+
+def _row_histograms(stack: FrameStack, groups: list[int], tick) -> tuple[RowHistograms, ...]:
+    channels, frames = stack.channels, max(stack.n_frames[i] for i in groups)
+    coding = [_codings(stack, i) for i in groups]
+    # One number of bins for all channels and exposures: they share compiled programs.
+    bins = round_up(2 + max(n for of in coding for _, _, n in of.values()))
+    rows = {c: stack.shape[0] // row_stride(stack.cfa, c) for c in channels}
+    pixels = stack.shape[1] if stack.cfa == "mono" else stack.shape[1] // 2
+    dtype = np.uint16 if pixels < 65536 else np.uint32
+    counts = {c: np.zeros((len(groups), frames, rows[c], bins), dtype) for c in channels}
+    moments = {c: np.zeros((2, len(groups), frames, rows[c])) for c in channels}
+    for e, i in enumerate(groups):
+        for f, frame in enumerate(stack.frames(i)):
+            for c in channels:
+                y = channel_rows(frame, stack.cfa, c)
+                low, width, _ = coding[e][c]
+                counts[c][e, f] = _count_rows(y, low, width, bins, stack.white_level)
+                moments[c][:, e, f] = y.sum(1, dtype=np.float64), np.einsum("rp,rp->r", y, y, dtype=np.float64)
+            tick()
+    edges = {c: np.stack([_edges(*of[c][:2], bins, stack.white_level) for of in coding]) for c in channels}
+    return tuple(
+        RowHistograms(
+            counts=counts[c],
+            edges_dn=edges[c],
+            row_sum=moments[c][0],
+            row_sum_of_squares=moments[c][1],
+            outlier_law=_outlier_law(counts[c], edges[c]),
+            channel=c,
+            row_stride=row_stride(stack.cfa, c),
+        )
+        for c in channels
+    )
+
+
+def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
+    """Law of pixels with extra charge: above the median, half exponential near the others, half anywhere.
+
+    Thermal generation in silicon leaves an exponential tail of warm pixels; its scale here is OUTLIER_SCALE times the
+    half width of the counts below their median, which outliers do not reach.
+    """
+    laws = []
+    for pooled, edges in zip(counts.sum((1, 2), dtype=np.float64), edges_dn, strict=True):
+        cumulative = np.cumsum(pooled)[:-1] / pooled.sum()
+        median, low = (edges[min(np.searchsorted(cumulative, q), len(edges) - 1)] for q in (0.5, 0.1587))
+        scale = OUTLIER_SCALE * max(median - low, 1.0)
+        survival = np.exp(-np.maximum(edges - median, 0.0) / scale)
+        tail = -np.diff(np.concatenate([[1.0], survival, [0.0]]))
+        anywhere = np.concatenate([[False], edges >= median]).astype(np.float64)
+        laws.append(0.5 * tail + 0.5 * anywhere / anywhere.sum())
+    return np.stack(laws)
+
+
+def _codings(stack: FrameStack, group: int) -> dict[str, tuple[int, int, int]]:
+    """`_coding` of each channel of an exposure, from its first and last frame."""
+    ends = [stack.frame(group, f) for f in sorted({0, stack.n_frames[group] - 1})]
+    return {
+        c: _coding(np.stack([channel_rows(frame, stack.cfa, c) for frame in ends]), stack.white_level)
+        for c in stack.channels
+    }
+
+
+def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, int]:
+    """(first code, codes per bin, bins) of the law that a sample [frame, row, pixel] of one channel comes from.
+
+    The range is robust (quantiles), so that hot pixels do not stretch it: what lies outside is one open bin.
+    """
+    sample = sample[:, :: max(1, sample.size // SAMPLE_PIXELS)]
+    q05, q50, q95 = np.quantile(sample, [0.05, 0.5, 0.95])
+    sigma = max(float(np.sqrt(np.median(sample.var(-1)))), 0.5)
+    reach = RANGE_SIGMAS / 1.645
+    low = int(max(q50 - reach * max(q50 - q05, sigma), 1))  # code 0 is always in the first, open bin
+    high = int(q50 + reach * max(q95 - q50, sigma)) + 2
+    if white_level is not None:
+        high = min(high, int(white_level))
+        low = min(low, high - 1)
+    width = max(1, int(sigma / BINS_PER_SIGMA), -(-(high - low) // (MOST_BINS - 2)))
+    return low, width, max(1, -(-(high - low) // width))
+
+
+def _edges(low: int, width: int, bins: int, white_level: float | None) -> np.ndarray:
+    edges = low - 0.5 + width * np.arange(bins - 1, dtype=np.float64)
+    # Counts at the white level are clipped: they may hold everything above, so no edge lies beyond.
+    return edges if white_level is None else np.minimum(edges, white_level - 0.5)
+
+
+def _count_rows(y: np.ndarray, low: int, width: int, bins: int, white_level: float | None) -> np.ndarray:
+    """Histogram of each row of `y` over the bins of `_edges`."""
+    code = y.astype(np.int32)
+    code -= low
+    if width > 1:
+        np.floor_divide(code, width, out=code)
+    code += 1
+    np.clip(code, 0, bins - 1, out=code)
+    if white_level is not None:
+        code[y >= white_level] = bins - 1
+    code += (bins * np.arange(len(y), dtype=np.int32))[:, None]
+    return np.bincount(code.ravel(), minlength=bins * len(y)).reshape(len(y), bins)
+
+
+def _flat_moments(stack: FrameStack, groups: list[int], tick) -> FlatMoments:
+    columns = [_flat_level(stack, i, tick) for i in groups]
+    mean, variance, dof, row_power, row_dof, pixels = (np.stack(x) for x in zip(*columns, strict=True))
+    photons = None if stack.photons_e is None else np.asarray(stack.photons_e, np.float64)[groups]
+    exposure = np.asarray([stack.exposure_s[i] for i in groups], np.float64)
+    return FlatMoments(exposure, mean, variance, dof, row_power, row_dof, pixels, photons)
+
+
+def _check_same_light(levels: list[float], stack: FrameStack, group: int) -> None:
+    """Frames of a flat group must be of one light: a lamp may flicker, not change."""
+    if max(levels) - min(levels) > FLICKER * np.mean(levels):
+        raise ValueError(
+            f"flats: frames of exposure group {group} ({stack.exposure_s[group]:g} s) differ in mean, from"
+            f" {min(levels):.4g} to {max(levels):.4g} DN; a group holds frames of the same light, so give each"
+            " brightness its own group (its own array, or its own exposure_s)"
+        )
+
+
+def _flat_level(stack: FrameStack, group: int, tick):
+    """Mean, temporal variance and row power of one flat level, each [channel]."""
+    if stack.n_frames[group] < 2:
+        raise ValueError(
+            f"flats: exposure group {group} ({stack.exposure_s[group]:g} s) has one frame; photon transfer needs at"
+            " least two frames of the same light, because only differences are free of the fixed pattern"
+        )
+    channels, n = stack.channels, stack.n_frames[group]
+    totals: dict[str, list] = {c: [0.0, 0.0, []] for c in channels}
+    for frame in stack.frames(group):
+        for c in channels:
+            y = channel_rows(frame, stack.cfa, c).astype(np.float32)
+            row_mean = y.mean(1, dtype=np.float64)
+            y -= row_mean[:, None].astype(np.float32)
+            totals[c][0] = totals[c][0] + y
+            totals[c][1] = totals[c][1] + y * y
+            totals[c][2].append(row_mean)
+        tick()
+    out = []
+    for c in channels:
+        first, second, means = totals[c]
+        _check_same_light([m.mean() for m in means], stack, group)
+        rows, pixels = first.shape
+        dof = rows * (pixels - 1) * (n - 1)
+        variance = float((second.astype(np.float64) - first.astype(np.float64) ** 2 / n).sum() / dof)
+        series = np.stack(means)
+        moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
+        moving -= moving.mean(0, keepdims=True)
+        row_dof = (rows - 1) * (n - 1)
+        out.append((series.mean(), variance, dof, float((moving**2).sum() / row_dof), row_dof, pixels))
+    return tuple(np.asarray(x, np.float64) for x in zip(*out, strict=True))

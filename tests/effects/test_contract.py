@@ -1,0 +1,159 @@
+"""What every effect promises, checked over the one list of effects."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hsnoise.effects
+from hsnoise.effects import (
+    ADC,
+    EFFECTS,
+    AbstractEffect,
+    BlackLevel,
+    Capture,
+    DarkCurrent,
+    Gain,
+    ReadNoise,
+    RowGain,
+    ShotNoise,
+    Stage,
+)
+from hsnoise.model import NoiseModel, sample
+
+KEY = jax.random.key(7)
+SHAPE = (2, 4, 6)
+FOLDER = Path(hsnoise.effects.__file__).parent
+
+# One instance of each effect, for a Bayer sensor.
+EXAMPLES = [
+    ShotNoise(),
+    DarkCurrent(51.7),
+    ReadNoise(3.5),
+    RowGain([0.2, 0.1, 0.05], 1.0),
+    Gain([1.5, 1.2, 1.3]),
+    BlackLevel([64.0, 65.0, 66.0]),
+    ADC(4095),
+]
+each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: effect.name)
+
+
+def model_of(effect):
+    return NoiseModel([effect], cfa="RGGB", shutter="rolling", exposure_s=0.1)
+
+
+def signal():
+    return np.linspace(0.0, 40.0, np.prod(SHAPE)).reshape(SHAPE)
+
+
+def test_every_effect_has_an_example():
+    assert [type(effect) for effect in EXAMPLES] == list(EFFECTS)
+
+
+def test_catalogue_is_complete():
+    modules = sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))
+    assert sorted(effect.name for effect in EFFECTS) == modules
+    assert [effect.__module__ for effect in EFFECTS] == [f"hsnoise.effects.{effect.name}" for effect in EFFECTS]
+
+
+def test_no_effect_imports_another():
+    for path in FOLDER.glob("[a-z]*.py"):
+        imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        own = {node.module for node in imports if node.module.startswith("hsnoise")}
+        assert own <= {"hsnoise._types", "hsnoise.effects._base"}, path
+
+
+@each_effect
+def test_effect_is_final(effect):
+    assert type(effect).__mro__[1] is AbstractEffect
+    assert not inspect.isabstract(type(effect))
+    assert isinstance(effect.stage, Stage)
+    assert type(effect).__doc__
+
+
+@each_effect
+def test_parameters_are_declared(effect):
+    leaves = jax.tree.leaves(effect)
+    specs = effect.specs()
+    assert len(leaves) == len(specs)
+    assert all(spec.unit and spec.doc for spec in specs.values())
+    json.dumps(effect.settings())
+    named = effect.parameters(("R", "G", "B"))
+    assert len(named) == sum(3 if spec.per_channel else 1 for spec in specs.values())
+    assert all(p.name == effect.name or p.name.startswith(f"{effect.name}.") for p in named)
+
+
+@each_effect
+def test_bounds_are_enforced(effect):
+    for field, spec in effect.specs().items():
+        others = {name: getattr(effect, name) for name in effect.specs() if name != field}
+        outside = [np.nan, np.inf]
+        outside += [] if spec.low is None else [spec.low - 1]
+        outside += [] if spec.high is None else [spec.high + 1]
+        for value in outside:
+            with pytest.raises(ValueError, match=rf"{effect.name}\.{field}: expected finite values"):
+                type(effect)(**others, **{field: value})
+
+
+@each_effect
+def test_same_key_same_draw(effect):
+    model = model_of(effect)
+    first, again = sample(KEY, signal(), model), sample(KEY, signal(), model)
+    other = sample(jax.random.key(8), signal(), model)
+    assert first.shape == SHAPE
+    np.testing.assert_array_equal(first, again)
+    deterministic = isinstance(effect, Gain | BlackLevel | ADC)
+    assert np.array_equal(first, other) == deterministic
+
+
+@each_effect
+def test_jit_is_eager(effect):
+    model = model_of(effect)
+    capture = Capture(jnp.asarray(0.1), SHAPE[1:], "RGGB", "rolling")
+
+    def draw(effect):
+        return effect.sample(jnp.asarray(signal()), capture, key=KEY)
+
+    eager = draw(model.effects[0])
+    np.testing.assert_allclose(jax.jit(draw)(model.effects[0]), eager, rtol=1e-12)
+
+
+@each_effect
+def test_vmap_is_a_loop(effect):
+    model = model_of(effect)
+    keys = jax.random.split(KEY, 2)
+    scales = jnp.array([1.0, 0.5])
+
+    def draw(key, scale):
+        scaled = jax.tree.map(lambda leaf: leaf * scale, model)
+        return sample(key, signal(), scaled, exposure_s=0.1 * scale)
+
+    looped = np.stack([draw(*pair) for pair in zip(keys, scales, strict=True)])
+    np.testing.assert_allclose(jax.vmap(draw)(keys, scales), looped, rtol=1e-12)
+
+
+@each_effect
+@pytest.mark.parametrize("x64", [False, True])
+def test_precision_follows_the_session(effect, x64):
+    expected = jnp.float64 if x64 else jnp.float32
+    with jax.enable_x64(x64):
+        drawn = sample(KEY, signal(), model_of(effect))  # the example's own parameters are float64
+        assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else expected)
+        assert np.all(np.isfinite(drawn))
+
+
+@each_effect
+def test_gradients_are_finite(effect):
+    def smooth(model, exposure_s):
+        drawn = sample(KEY, signal(), model, exposure_s=exposure_s).astype(float)
+        return jnp.tanh(drawn / 100).sum()
+
+    gradient = jax.grad(smooth, argnums=(0, 1))(model_of(effect), 0.1)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))

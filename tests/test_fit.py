@@ -1,0 +1,299 @@
+"""Fits of simulated captures: recovered parameters and honest errors, what is not determined, bad input."""
+
+from __future__ import annotations
+
+import importlib
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise import maximise as maximise_module
+from hsnoise.model import sample_dark
+
+EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
+FRAMES, SHAPE = 4, (96, 128)
+
+
+def capture(model, *, seed=7, exposure_s=EXPOSURE_S, frames=FRAMES, shape=SHAPE, black_level="known", change=None):
+    keys = jax.random.split(jax.random.key(seed), len(exposure_s))
+    counts = [
+        np.asarray(sample_dark(k, frames, shape, model, exposure_s=t)) for k, t in zip(keys, exposure_s, strict=True)
+    ]
+    if change is not None:
+        counts = [change(c, t) for c, t in zip(counts, exposure_s, strict=True)]
+    black = np.asarray(model["black_level"].value, float) if black_level == "known" else None
+    return hsnoise.FrameStack(counts, exposure_s, black_level=black, cfa=model.cfa, shutter=model.shutter)
+
+
+def pulls(result, model):
+    """(estimate - truth) / standard error of all fitted parameters."""
+    truth = {name: value for name, (value, _) in model.table().items()}
+    return {name: (result.table[name][0] - truth[name]) / result.table[name][1] for name in result.names}
+
+
+def assert_recovered(result, model, *, sigmas=4.5):
+    assert result.method == "ml" and result.outcome.startswith("converged")
+    found = pulls(result, model)
+    assert max(map(abs, found.values())) < sigmas, found
+    assert all(np.isfinite(value) for value, _, _ in result.table.values())
+
+
+@pytest.fixture(scope="module")
+def canon_fit():
+    model = hsnoise.cameras.canon_5d3()
+    return model, hsnoise.fit(capture(model))
+
+
+def test_canon_clipped_at_black_with_coloured_rows(canon_fit):
+    model, result = canon_fit
+    assert_recovered(result, model)
+    assert result.notes == ()
+    assert set(result.names) < set(result.table)
+    # Each parameter is known to within a third: the errors are neither zero nor absurd.
+    assert all(0 < result.table[name][1] < 0.34 * abs(result.table[name][0]) for name in result.names)
+
+
+def test_printed_result_holds_every_parameter_with_its_error(canon_fit):
+    _, result = canon_fit
+    text = str(result)
+    for name, (_, _, unit) in result.table.items():
+        line = next(line for line in text.splitlines() if f" {name} " in line)
+        assert unit in line
+    assert "converged" in text and "given" in text
+
+
+def test_fitted_model_samples_and_survives_its_file(canon_fit, tmp_path):
+    _, result = canon_fit
+    result.params.save(tmp_path / "camera.json", provenance={"method": result.method})
+    assert json.loads((tmp_path / "camera.json").read_text())["provenance"] == {"method": "ml"}
+    again = hsnoise.NoiseModel.load(tmp_path / "camera.json")
+    assert again.table() == result.params.table()
+    frames = hsnoise.sample(jax.random.key(0), np.full((3, 8, 8), 4.0), again)
+    assert frames.shape == (3, 8, 8) and frames.dtype == np.uint32  # no white level is known
+
+
+def test_expected_histograms_match_the_measured_ones(canon_fit):
+    _, result = canon_fit
+    for h, expected in zip(result.summary.histograms, result.expected_histograms(), strict=True):
+        measured = h.counts.sum((1, 2), dtype=float)
+        np.testing.assert_allclose(expected.sum(1), measured.sum(1))
+        misplaced = 0.5 * np.abs(measured - expected).sum(1) / measured.sum(1)
+        assert misplaced.max() < 0.05  # rows of a few frames leave their mark on the red channel
+
+
+@pytest.mark.parametrize(
+    ("camera", "black"), [("canon_5d3", 2000.0), ("grasshopper3", 64.0), ("grasshopper3", 0.0)], ids=str
+)
+@pytest.mark.parametrize("black_level", ["known", "unknown"])
+def test_cameras_and_black_levels(camera, black, black_level):
+    if black == 0 and black_level == "unknown":
+        black = 3.0  # estimated although part of the counts is clipped
+    model = getattr(hsnoise.cameras, camera)(black_level_dn=black)
+    assert_recovered(hsnoise.fit(capture(model, black_level=black_level)), model)
+
+
+@pytest.mark.parametrize(("exposures", "frames"), [(8, 2), (2, 12)])
+def test_numbers_of_exposures_and_frames(exposures, frames):
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    exposure_s = tuple(np.geomspace(0.01, 0.3, exposures))
+    assert_recovered(hsnoise.fit(capture(model, exposure_s=exposure_s, frames=frames, shape=(64, 96))), model)
+
+
+def test_ragged_frames_and_single_ones():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    whole = capture(model)
+    ragged = [c[:n] for c, n in zip(whole.counts, (4, 1, 3, 1), strict=True)]
+    stack = hsnoise.FrameStack(ragged, EXPOSURE_S, black_level=64, cfa="RGGB", shutter="global")
+    assert_recovered(hsnoise.fit(stack), model)
+
+
+def test_model_without_row_gain_is_fitted_without():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64).remove("row_gain")
+    result = hsnoise.fit(capture(model), model=model)
+    assert_recovered(result, model)
+    assert "row_gain.sigma.R" not in result.table and "row_gain" not in result.params
+
+
+def test_one_exposure_says_what_it_does_not_determine():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    result = hsnoise.fit(capture(model, exposure_s=(0.0005,), black_level="unknown"))
+    for name in ("gain.G", "dark_current.rate"):
+        value, error, _ = result.table[name]
+        assert abs(value - model.table()[name][0]) < 4.5 * error
+    assert result.table["gain.R"][1] > 0.3 * result.table["gain.R"][0]
+    assert any("gain.R is not determined" in note and "flats" in note for note in result.notes)
+
+
+def test_bias_frames_alone_do_not_determine_gain_or_dark_current():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    result = hsnoise.fit(capture(model, exposure_s=(0.0,)))
+    text = " ".join(result.notes)
+    assert "dark_current.rate is not determined" in text and "gain.G is not determined" in text
+    assert result.table["dark_current.rate"][1] == np.inf
+    assert "not determined" in str(result) and "nan" not in str(result).lower()
+
+
+def test_flats_determine_the_gain_of_a_camera_without_dark_current(rng):
+    gain, read, black, light = 0.5, 3.0, 100.0, (50.0, 400.0, 2000.0)
+    pattern = 1 + 0.02 * rng.standard_normal(SHAPE)
+
+    def frames(mean_e):
+        electrons = rng.poisson(mean_e * pattern, (4, *SHAPE)) + read * rng.standard_normal((4, *SHAPE))
+        return np.rint(gain * electrons + black).astype(np.uint16)
+
+    stack = hsnoise.FrameStack(
+        [frames(0.0), frames(0.0), *map(frames, light)],
+        [0.001, 0.1, *(x / 1000 for x in light)],
+        kind=["dark", "dark", "flat", "flat", "flat"],
+        shutter="global",
+    )
+    result = hsnoise.fit(stack)
+    for name, truth in (("gain", gain), ("read_noise.sigma", read), ("black_level", black)):
+        value, error, _ = result.table[name]
+        assert abs(value - truth) < 4.5 * error and error < 0.05 * truth
+    rate, error, _ = result.table["dark_current.rate"]
+    assert rate < 4 * error and 0.02 < error < 2.0
+    assert any("dark_current.rate is compatible with zero" in note for note in result.notes)
+    assert any("row_gain.sigma is compatible with zero" in note for note in result.notes)
+
+
+def test_hot_pixels_are_set_apart_and_told(rng):
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    hot = rng.random(SHAPE) < 0.004
+    extra = rng.exponential(4000, SHAPE) * hot
+
+    def add(counts, exposure_s):
+        return np.clip(counts + extra * exposure_s * 3, 0, 65535).astype(np.uint16)
+
+    result = hsnoise.fit(capture(model, change=add))
+    assert_recovered(result, model, sigmas=6)
+    assert any("follow no law of this model" in note for note in result.notes)
+
+
+def test_frames_that_saw_light_are_called_flats():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    bright = capture(model, exposure_s=(0.001, 0.002))
+    light = [
+        np.asarray(hsnoise.sample(jax.random.key(i), np.full((4, *SHAPE), x), model))
+        for i, x in enumerate((300.0, 600.0))
+    ]
+    stack = hsnoise.FrameStack(light, bright.exposure_s, black_level=64, cfa="RGGB", shutter="global")
+    assert any("pass kind='flat'" in note for note in hsnoise.fit(stack).notes)
+
+
+def not_converged(coordinates, summary):
+    end = maximise_module.maximise(coordinates, summary)
+    return end._replace(converged=False, outcome="stopped by the test")
+
+
+def test_auto_falls_back_to_the_line_loudly_and_ml_refuses(monkeypatch):
+    stack = capture(hsnoise.cameras.grasshopper3(black_level_dn=64))
+    monkeypatch.setattr(importlib.import_module("hsnoise.fit"), "maximise", not_converged)
+    result = hsnoise.fit(stack)
+    assert result.method == "line" and "MAXIMUM LIKELIHOOD DID NOT CONVERGE" in result.outcome
+    assert "MAXIMUM LIKELIHOOD DID NOT CONVERGE" in str(result).replace("\n", " ")
+    with pytest.raises(RuntimeError, match="stopped by the test"):
+        hsnoise.fit(stack, method="ml")
+
+
+def test_line_method_and_likelihood_agree(canon_fit):
+    model, result = canon_fit
+    line = hsnoise.fit(result.summary, method="line")
+    assert line.method == "line" and line.names == result.names
+    for name in ("gain.G", "dark_current.rate", "read_noise.sigma"):
+        difference = line.table[name][0] - result.table[name][0]
+        assert abs(difference) < 5 * np.hypot(line.table[name][1], result.table[name][1])
+
+
+def test_pilot_of_a_large_capture_ends_where_the_whole_does(monkeypatch, canon_fit):
+    _, whole = canon_fit
+    monkeypatch.setattr(maximise_module, "PILOT_ROWS", 2600)  # half the frames
+    piloted = hsnoise.fit(whole.summary)
+    assert piloted.outcome.startswith("converged")
+    for name in whole.names:
+        value, error, _ = whole.table[name]
+        assert abs(piloted.table[name][0] - value) < 0.1 * error
+        assert 0.7 < piloted.table[name][1] / error < 1.4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "fast"}, "method"),
+        ({"model": hsnoise.cameras.canon_5d3()}, "model"),
+        ({"model": hsnoise.cameras.grasshopper3().remove("gain")}, "gain"),
+    ],
+)
+def test_bad_arguments_are_refused(change, message):
+    stack = capture(hsnoise.cameras.grasshopper3(black_level_dn=64), frames=1, shape=(8, 8))
+    with pytest.raises(ValueError, match=message):
+        hsnoise.fit(stack, **change)
+
+
+def test_wrong_exposures_are_told():
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    right = capture(model)
+    reversed_ = hsnoise.FrameStack(right.counts, EXPOSURE_S[::-1], black_level=64, cfa="RGGB", shutter="global")
+    assert any("are the exposures right?" in note for note in hsnoise.fit(reversed_).notes)
+
+
+def test_flats_of_several_lights_in_one_group_are_refused(rng):
+    flats = np.concatenate([np.rint(0.5 * rng.poisson(x, (2, 16, 16)) + 50) for x in (100, 500)]).astype(np.uint16)
+    with pytest.raises(ValueError, match="same light"):
+        hsnoise.fit(flats, exposure_s=0.1, kind="flat", black_level=50, shutter="global")
+
+
+def test_directions_known_a_thousand_times_better_than_others_leave_errors_honest(rng):
+    """Read noise far above shot noise: the product of gain and dark current is known well, each alone hardly."""
+    frames = [
+        np.rint(1.5 * (rng.poisson(50 * t, (4, 64, 96)) + 40 * rng.standard_normal((4, 64, 96))) + 400)
+        for t in (0.1, 0.4, 3.2)
+    ]
+    result = hsnoise.fit(
+        [f.astype(np.uint16) for f in frames], exposure_s=[0.1, 0.4, 3.2], black_level=400, shutter="global"
+    )
+    value, error, _ = result.table["gain"]
+    assert abs(value - 1.5) < 4.5 * error
+    assert 0.05 < error < 1.0
+
+
+def test_flats_alone_need_a_black_level(rng):
+    flats = [np.rint(0.5 * rng.poisson(x, (3, 16, 16)) + 50).astype(np.uint16) for x in (100, 500)]
+    with pytest.raises(ValueError, match="black_level"):
+        hsnoise.fit(flats, exposure_s=[0.1, 0.5], kind="flat", shutter="global")
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("case", ["a", "b"])
+def test_cases_of_another_simulator_are_recovered(shared_data, case):
+    answers = json.loads((shared_data / "cases" / "answers.json").read_text())[f"case_{case}"]["base"]
+    with np.load(shared_data / "cases" / f"case_{case}.npz") as stored:
+        result = hsnoise.fit(
+            stored["counts"],
+            exposure_s=stored["exposure_s"],
+            black_level=float(stored["black_level"]),
+            white_level=float(stored["white_level"]),
+            cfa=str(stored["cfa"]),
+            shutter=str(stored["shutter"]),
+        )
+    truth = {f"gain.{c}": answers["gain_dn_per_e"][c] for c in "RGB"}
+    truth |= {f"row_gain.sigma.{c}": answers["row_gain_sigma"][c] for c in "RGB"}
+    truth |= {"dark_current.rate": answers["dark_current_e_per_s"], "read_noise.sigma": answers["read_noise_e"]}
+    truth |= {"row_gain.exponent": answers["row_spectrum_exponent"]}
+    for name in result.names:
+        value, error, _ = result.table[name]
+        assert abs(value - truth[name]) < 3 * error, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["canon_5d3", "grasshopper3"])
+def test_intervals_cover(camera):
+    """24 captures: root mean square pull of each parameter within what 24 unit normals allow."""
+    model = getattr(hsnoise.cameras, camera)(black_level_dn=64 if camera == "grasshopper3" else 0)
+    found = [pulls(hsnoise.fit(capture(model, seed=100 + seed), method="ml"), model) for seed in range(24)]
+    for name in found[0]:
+        rms = np.sqrt(np.mean([f[name] ** 2 for f in found]))
+        assert 0.6 < rms < 1.5, (name, rms)

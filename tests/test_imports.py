@@ -1,0 +1,78 @@
+"""The import order of the architecture: see docs/architecture.md."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hsnoise
+
+ROOT = Path(hsnoise.__file__).parent
+# A module may import those before it, and its own package.
+ORDER = """_types _keys _numerics _frames _arguments _output stack io effects model cameras photometry statistics
+    rows physics moments plan likelihood coordinates maximise result notes lut
+    line_spectrum line fit plots _options cli""".split()
+IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames"}
+FILES = [path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"]
+
+
+def top(module: str) -> str:
+    """hsnoise.io._fits to io."""
+    return module.split(".")[1] if "." in module else module
+
+
+def imports(path: Path) -> set[str]:
+    """Dotted names of the hsnoise modules that a file imports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            module = f"{node.module}"
+            found |= {f"hsnoise.{name.name}" for name in node.names} if module == "hsnoise" else {module}
+    return {name for name in found if name.split(".")[0] == "hsnoise"}
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).with_suffix("").parts[0]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_only_go_down(path):
+    name = name_of(path)
+    assert name in ORDER, f"{name}: add it to ORDER where it belongs"
+    if name == "cli":  # it sees all public names
+        return
+    seen = {top(module) for module in imports(path)} - {name}
+    above = seen - set(ORDER[: ORDER.index(name)])
+    assert not above, f"{path.name} imports {above}"
+    if name == "io":
+        assert seen <= IO_MAY_SEE
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if p.parent.name == "effects" and p.name != "__init__.py"])
+def test_effects_never_see_each_other(path):
+    within = {module for module in imports(path) if top(module) == "effects"}
+    assert within <= {"hsnoise.effects._base"}
+
+
+def test_model_knows_no_single_effect():
+    within = {module for module in imports(ROOT / "model.py") if top(module) == "effects"}
+    assert within <= {"hsnoise.effects", "hsnoise.effects._base"}
+
+
+def test_import_is_light_and_leaves_jax_alone():
+    code = """
+import sys, jax
+before = dict(jax.config.values)
+import hsnoise
+assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
+heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL"} & set(sys.modules)
+assert not heavy, heavy
+assert set(hsnoise.__all__) <= set(dir(hsnoise))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
