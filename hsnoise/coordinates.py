@@ -49,6 +49,13 @@ class Coordinates(eqx.Module):
     def physics(self, vector) -> Physics:
         return self._fill(vector, self._inverse)
 
+    def reach(self, vector) -> np.ndarray:
+        """How far each coordinate may go from `vector` before the rows' quadrature has to be planned anew."""
+        names = np.repeat(self.free, [np.size(getattr(self.base, name)) for name in self.free])
+        doubled = 5.0 + np.maximum(np.asarray(vector), 0.0)
+        fixed = {"black_level": np.inf, "dark_current": np.inf}
+        return np.where(np.isin(names, ["row_sigma"]), doubled, [fixed.get(name, 2.0) for name in names])
+
     def slope(self, vector) -> jax.Array:
         """d parameter / d coordinate, [parameter]."""
         return jnp.diagonal(jax.jacfwd(lambda v: self.flat(self.physics(v)))(vector))

@@ -15,6 +15,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
 from hsnoise.physics import Physics, physics_of
+from hsnoise.profile import profile_errors
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, summarise
@@ -98,6 +99,10 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
     maximum = maximise(coordinates, summary)
     names = labels(coordinates, summary.channels)
     covariance = _covariance(maximum.information)
+    if maximum.converged:
+        deviation = np.sqrt(np.diagonal(covariance))
+        grown = np.maximum(profile_errors(coordinates, maximum, summary) / deviation, 1.0)
+        covariance = covariance * grown[:, None] * grown[None, :]
     kept = [i for i, name in enumerate(names) if not name.startswith("outliers")]  # shares of outliers are nuisances
     result = FitResult(
         params=_model_with(maximum.physics, summary, model),

@@ -17,7 +17,7 @@ from hsnoise.physics import Physics, Rules, evaluate
 from hsnoise.plan import plan_rules
 from hsnoise.statistics import Summary, first_frames, without_counts
 
-ROUNDS = 8
+ROUNDS = 16
 STEPS = 60
 CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many standard errors
 FIRST_SPREAD = 0.03  # taken for a standard error of every coordinate before one is known
@@ -70,12 +70,12 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
     value, gradient, whiten = _curvature(coordinates, vector, whiten, light, rules)
     iterations, distance = 0, np.inf
     for _ in range(ROUNDS):
-        ahead, steps = _quasi_newton(coordinates, vector, whiten, value, light, rules)
+        ahead, steps = quasi_newton(coordinates, vector, whiten, coordinates.reach(vector), value, light, rules)
         iterations += int(steps)
         if not np.isfinite(ahead).all():
             distance = np.inf
             break
-        rules = _replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary))
+        rules = replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary))
         value, gradient, whiten = _curvature(coordinates, ahead, whiten, light, rules)
         # Length in standard errors of the Newton step that is left.
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
@@ -95,7 +95,7 @@ def _by_chords(coordinates: Coordinates, summary: Summary, start: Maximum, scale
     rules = plan_rules(start.physics, summary, CHORD_MARGIN)
     best, steps = np.inf, 0
     while True:
-        value, gradient = (np.asarray(x) for x in _gradient(coordinates, jnp.asarray(vector), light, rules))
+        value, gradient = (np.asarray(x) for x in gradient_at(coordinates, jnp.asarray(vector), light, rules))
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
         if distance < CLOSE_SIGMA or distance > 2 * best or steps == CHORDS:
             break
@@ -110,20 +110,24 @@ def _objective(coordinates: Coordinates, vector, summary: Summary, rules: Rules)
 
 
 @eqx.filter_jit
-def _quasi_newton(coordinates, vector, whiten, reference, summary, rules):
-    """BFGS in coordinates whose unit is about one standard error, so that its first step is Newton's."""
+def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
+    """BFGS in coordinates whose unit is about one standard error, so that its first step is Newton's.
+
+    It moves in the space that the columns of `whiten` span, less than `reach` from `vector`.
+    """
 
     def loss(y, _):
-        loss = reference - _objective(coordinates, vector + whiten @ y, summary, rules)
-        return jnp.where(jnp.isfinite(loss), loss, 1e12)
+        ahead = vector + whiten @ y
+        loss = reference - _objective(coordinates, ahead, summary, rules)
+        return jnp.where(jnp.isfinite(loss) & (jnp.abs(ahead - vector) < reach).all(), loss, 1e12)
 
     solver = optx.BFGS(rtol=0.0, atol=1e-2, norm=optx.max_norm)
-    solution = optx.minimise(loss, solver, jnp.zeros_like(vector), max_steps=STEPS, throw=False)
+    solution = optx.minimise(loss, solver, jnp.zeros(whiten.shape[1]), max_steps=STEPS, throw=False)
     return vector + whiten @ solution.value, solution.stats["num_steps"]
 
 
 @eqx.filter_jit
-def _gradient(coordinates, vector, summary, rules):
+def gradient_at(coordinates, vector, summary, rules):
     return jax.value_and_grad(partial(_at, coordinates, summary, rules))(vector)
 
 
@@ -186,7 +190,7 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-15))
 
 
-def _replan(old: Rules, new: Rules) -> Rules:
+def replan(old: Rules, new: Rules) -> Rules:
     """New rules with the old numbers of nodes where they are enough, which spares a compilation."""
 
     def enough(old, new):

@@ -25,19 +25,23 @@ def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | 
     parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
     relative = error / max(abs(value), 1e-30)
     if parameter == "gain" and relative > UNDETERMINED:
-        return f"{name} is not determined (standard error {error:.2g} {unit}): add flats, or darks of longer exposures."
+        known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
+        return f"{name} is not determined{known}: add flats, or darks of longer exposures."
     if parameter == "read_noise.sigma" and relative > UNDETERMINED:
         in_dn = value * float(np.mean(result.physics.gain))
         return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
     if parameter == "dark_current.rate":
         return _dark_current_note(value, error, result)
     # It is a variance that is estimated: its own error is 2 value x error.
+    if parameter == "row_gain.sigma" and np.isinf(error):
+        return f"{name} is not determined: add darks of longer exposures, or flats."
     if parameter == "row_gain.sigma" and value < 4 * error:
         return f"{name} is compatible with zero (below {value + 2 * error:.2g})."
     if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
         return f"{name} is not determined: the row gain is too weak here to have a spectrum."
     if parameter == "black_level" and name in result.names and error > 1.0:
-        return f"{name} is not determined ({error:.2g} DN): add bias frames (0 s), or give black_level."
+        known = "" if np.isinf(error) else f" ({error:.2g} DN)"
+        return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."
     return None
 
 
@@ -47,6 +51,8 @@ def _dark_current_note(value: float, error: float, result: FitResult) -> str | N
         return "dark_current.rate is not determined: add dark frames."
     if not exposures.any():
         return "dark_current.rate is not determined: all darks are bias frames of 0 s; add darks of seconds to minutes."
+    if np.isinf(error):
+        return "dark_current.rate is not determined: add darks of other exposures, or flats."
     if value < 2 * error:
         longest = max(exposures)
         return (

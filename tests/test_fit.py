@@ -117,14 +117,26 @@ def test_model_without_row_gain_is_fitted_without():
     assert "row_gain.sigma.R" not in result.table and "row_gain" not in result.params
 
 
-def test_one_exposure_says_what_it_does_not_determine():
-    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
-    result = hsnoise.fit(capture(model, exposure_s=(0.0005,), black_level="unknown"))
-    for name in ("gain.G", "dark_current.rate"):
-        value, error, _ = result.table[name]
-        assert abs(value - model.table()[name][0]) < 4.5 * error
+def assert_gain_not_determined(model, exposure_s, black_level, seed):
+    result = hsnoise.fit(capture(model, seed=seed, exposure_s=(exposure_s,), black_level=black_level))
+    assert result.outcome.startswith("converged")
+    found = pulls(result, model)
+    assert max(map(abs, found.values())) < 4, found
     assert result.table["gain.R"][1] > 0.3 * result.table["gain.R"][0]
     assert any("gain.R is not determined" in note and "flats" in note for note in result.notes)
+
+
+def test_one_exposure_says_what_it_does_not_determine():
+    assert_gain_not_determined(hsnoise.cameras.grasshopper3(black_level_dn=64), 0.0005, "unknown", seed=7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("black_level", ["known", "unknown"])
+@pytest.mark.parametrize("seed", [8, 9])
+def test_one_short_exposure_keeps_honest_errors(seed, black_level):
+    # The likelihood is a long, bent ridge here: its curvature alone gave errors ten times too small.
+    assert_gain_not_determined(hsnoise.cameras.grasshopper3(black_level_dn=64), 0.0005, black_level, seed)
+    assert_gain_not_determined(hsnoise.cameras.canon_5d3(black_level_dn=64), 0.0005, black_level, seed)
 
 
 def test_bias_frames_alone_do_not_determine_gain_or_dark_current():
