@@ -187,7 +187,7 @@ def _draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray,
     frames = []
     for e, f in track(tasks, "Drawing frames", console=console, transient=True, disable=not console.is_terminal):
         frame_key = jax.random.fold_in(jax.random.fold_in(key, e), f)
-        frames.append(np.asarray(hsnoise.sample(frame_key, clean, model, exposure_s=exposures_s[e])))
+        frames.append(np.asarray(hsnoise.sample(frame_key, clean, model, exposure_s=exposures_s[e], sensor_key=key)))
     counts = np.stack(frames).reshape(len(exposures_s), n_frames, *clean.shape)
     return counts.astype(np.uint16) if counts.max() <= np.iinfo(np.uint16).max else counts
 

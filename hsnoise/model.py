@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -167,7 +169,14 @@ class NoiseModel(eqx.Module):
             raise ValueError(f"{path}: {error}") from error
 
 
-def sample(key: RandomKey, clean: ArrayLike, params: NoiseModel, *, exposure_s: float | Scalar | None = None) -> Array:
+def sample(
+    key: RandomKey,
+    clean: ArrayLike,
+    params: NoiseModel,
+    *,
+    exposure_s: float | Scalar | None = None,
+    sensor_key: RandomKey | None = None,
+) -> Array:
     """Draw what the sensor makes of a clean image: counts in DN.
 
     Every leading index of `clean` is a frame of its own, with its own row gains. Each effect draws from a key
@@ -179,6 +188,8 @@ def sample(key: RandomKey, clean: ArrayLike, params: NoiseModel, *, exposure_s: 
         clean: expected photoelectrons of each pixel, e-, [..., row, column]; zeros give dark frames.
         params: the noise model.
         exposure_s: exposure in seconds; that of the model by default.
+        sensor_key: key from which fixed patterns are drawn; the same key is the same sensor. By default derived
+            from `key`, so that each call is another sensor of the same make.
 
     Returns:
         Counts, the shape of `clean`: uint16 if the model's white level is at most 65535 DN, else uint32.
@@ -199,7 +210,8 @@ def sample(key: RandomKey, clean: ArrayLike, params: NoiseModel, *, exposure_s: 
     dtype = jnp.result_type(float)
     clean = jnp.asarray(_check_clean(clean, params.cfa), dtype)
     exposure = _check_exposure(params.exposure_s if exposure_s is None else exposure_s)
-    capture = Capture(jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter)
+    sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
+    capture = Capture(jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter, sensor_key)
     # A fit returns float64 parameters, whatever precision the session samples in.
     numbers, rest = eqx.partition(params.effects, eqx.is_inexact_array)
     numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
@@ -215,15 +227,22 @@ def sample_dark(
     params: NoiseModel,
     *,
     exposure_s: float | Scalar | None = None,
+    sensor_key: RandomKey | None = None,
 ) -> Array:
     """Draw dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`."""
-    return sample(key, np.zeros((n_frames, *shape), np.float32), params, exposure_s=exposure_s)
+    clean = np.zeros((n_frames, *shape), np.float32)
+    return sample(key, clean, params, exposure_s=exposure_s, sensor_key=sensor_key)
 
 
 @jax.jit
 def _apply(key, signal, effects, capture):
-    for effect in effects:
-        signal = effect.sample(signal, capture, key=named_key(key, effect.name))
+    keyed = [(effect, named_key(key, effect.name)) for effect in effects]
+    scales = [effect.read_noise_scale(capture, signal.shape, key=own) for effect, own in keyed]
+    scales = [scale for scale in scales if scale is not None]
+    if scales:
+        capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
+    for effect, own in keyed:
+        signal = effect.sample(signal, capture, key=own)
     return signal
 
 

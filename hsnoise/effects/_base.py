@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._keys import named_key
 from hsnoise._types import (
     Counts,
     FrameRows,
@@ -38,6 +39,8 @@ from hsnoise._types import (
     is_traced,
 )
 
+LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
+
 
 class Stage(enum.IntEnum):
     """Where in the sensor an effect acts: a model runs effects in this order, then in that of insertion."""
@@ -45,10 +48,12 @@ class Stage(enum.IntEnum):
     LIGHT = 0  # changes the expected photoelectrons, e-
     PHOTONS = 1  # draws the photoelectrons
     ELECTRONS = 2  # adds electrons, whole numbers
-    READ = 3  # adds to the signal while it is read, e-
-    GAIN = 4  # multiplies; after this stage the signal is in DN
-    BLACK = 5  # adds an offset, DN
-    DIGITAL = 6  # turns DN into counts, or counts into counts
+    COUPLING = 3  # mixes the electrons of neighbouring pixels or frames, e-
+    READ = 4  # adds to the signal while it is read, e-
+    READOUT = 5  # changes the signal and its read noise in the readout chain, e-
+    GAIN = 6  # multiplies; after this stage the signal is in DN
+    BLACK = 7  # adds an offset, DN
+    DIGITAL = 8  # turns DN into counts, or counts into counts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +87,7 @@ def param(
     low: float | None = None,
     high: float | None = None,
     per_channel: bool = False,
+    default: float | None = None,
     doc: str = "",
 ) -> Any:
     """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
@@ -90,10 +96,14 @@ def param(
         unit: its unit, "1" if it has none.
         low, high: inclusive bounds; None for unbounded.
         per_channel: one value per colour channel; a scalar given instead holds for all channels.
+        default: value unless one is given; None: one must be given.
         doc: its meaning in a few words.
     """
     spec = ParameterSpec(unit, low, high, per_channel, doc)
-    return eqx.field(converter=_as_leaf, metadata={"parameter": spec})
+    metadata = {"parameter": spec}
+    if default is None:
+        return eqx.field(converter=_as_leaf, metadata=metadata)
+    return eqx.field(converter=_as_leaf, metadata=metadata, default=default)
 
 
 class Capture(eqx.Module):
@@ -104,12 +114,20 @@ class Capture(eqx.Module):
         shape: rows and columns of the sensor.
         cfa: "mono" or a 2x2 Bayer string.
         shutter: "rolling" or "global".
+        sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
+        read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
     """
 
     exposure_s: Scalar
     shape: tuple[int, int] = eqx.field(static=True)
     cfa: str = eqx.field(static=True)
     shutter: str = eqx.field(static=True)
+    sensor_key: RandomKey
+    read_noise_scale: Frames | PixelMap | None = None
+
+    def fixed_key(self, name: str) -> RandomKey:
+        """The key from which the effect called `name` draws what never changes on this sensor."""
+        return named_key(self.sensor_key, name)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -155,6 +173,14 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:
         """What leaves the effect, [frame, row, column], when `signal` enters it; in the unit of its stage."""
+
+    def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> Frames | PixelMap | None:
+        """Factor on the read noise of each pixel, [frame or 1, row, column], for a signal of `shape`; None: 1.
+
+        Its mean square must be 1, so that the sigma of the read noise stays its rms. The factors of all effects
+        multiply. This is how an effect shapes the read noise without knowing the effect that draws it.
+        """
+        return None
 
     def __check_init__(self):
         for field, spec in self.specs().items():
@@ -207,3 +233,25 @@ def draw_poisson(key: RandomKey, mean: Frames) -> Frames:
     Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
     """
     return jax.random.poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)
+
+
+def coloured_normal(key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype) -> jax.Array:
+    """Normal series along axis 1 of `shape`, of variance 1 over the axis on average and power k^-exponent.
+
+    A series is a stationary periodic Gaussian process with independent periodogram bins, k = 1 ... n/2 cycles per
+    axis, and has no DC term. With exponent 0 it is independent normals instead, DC included.
+    """
+    white = jax.random.normal(key, shape, dtype)
+    spectrum = jnp.fft.rfft(white, axis=1) * _colour_filter(shape[1], exponent)[None, :, None]
+    return jnp.fft.irfft(spectrum, n=shape[1], axis=1)
+
+
+def _colour_filter(n: int, exponent: Scalar) -> jax.Array:
+    """Amplitudes at k = 0 ... n//2 that turn a white series of n into a coloured one of the same variance."""
+    # Amplitudes, not powers: the square root of a zero power at DC would have a NaN gradient.
+    k = jnp.minimum(jnp.arange(n), n - jnp.arange(n))
+    coloured = jnp.maximum(k, 1).astype(exponent.dtype) ** (-exponent / 2)
+    amplitude = jnp.where(k > 0, coloured, jnp.where(exponent == 0, 1, 0))
+    mean_power = jnp.mean(amplitude**2)
+    # A single row has only the DC term, so a coloured series over it is 0.
+    return amplitude[: n // 2 + 1] / jnp.sqrt(jnp.where(mean_power > 0, mean_power, 1))

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._types import Counts, Frames, RandomKey
-from hsnoise.effects._base import AbstractEffect, Capture, Stage
-
-_LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
+from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage
 
 
 class ADC(AbstractEffect):
@@ -29,11 +27,11 @@ class ADC(AbstractEffect):
 
     def __check_init__(self):
         white = self.white_level_dn
-        if white is not None and not (0 < white <= _LARGEST_UINT32 and white == int(white)):
+        if white is not None and not (0 < white <= LARGEST_UINT32 and white == int(white)):
             raise ValueError(f"adc.white_level_dn: expected a positive whole number or None, got {white!r}.")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Counts:
         white = self.white_level_dn
-        high = _LARGEST_UINT32 if white is None else white
+        high = LARGEST_UINT32 if white is None else white
         dtype = jnp.uint16 if high <= np.iinfo(np.uint16).max else jnp.uint32
         return jnp.clip(jnp.round(signal), 0, high).astype(dtype)

@@ -13,6 +13,9 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 class ReadNoise(AbstractEffect):
     """Read noise: Normal(0, sigma^2) in each pixel, referred to electrons.
 
+    Effects that shape it (heavy tails, another sigma in each pixel) give factors of mean square 1, so sigma stays
+    the standard deviation, rms over pixels.
+
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
 
@@ -21,4 +24,5 @@ class ReadNoise(AbstractEffect):
     sigma: Scalar = param("e-", low=0, doc="standard deviation of the read noise")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return signal + self.sigma * jax.random.normal(key, signal.shape, signal.dtype)
+        noise = self.sigma * jax.random.normal(key, signal.shape, signal.dtype)
+        return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 
 from hsnoise._types import Frames, PerChannel, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
 
 
 class RowGain(AbstractEffect):
@@ -32,20 +31,6 @@ class RowGain(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        white = jax.random.normal(key, (frames, rows, len(capture.channels)), signal.dtype)
-        coloured = jnp.fft.irfft(
-            jnp.fft.rfft(white, axis=1) * _row_filter(rows, exponent)[None, :, None], n=rows, axis=1
-        )
-        beta = 1 + self.sigma[None, None] * coloured
+        series = coloured_normal(key, (frames, rows, len(capture.channels)), exponent, signal.dtype)
+        beta = 1 + self.sigma[None, None] * series
         return signal * capture.per_row(jnp.maximum(beta, 0))
-
-
-def _row_filter(rows: int, exponent: Scalar) -> jax.Array:
-    """Amplitudes at k = 0 ... rows//2 that turn white rows into coloured ones of the same variance."""
-    # Amplitudes, not powers: the square root of a zero power at DC would have a NaN gradient.
-    k = jnp.minimum(jnp.arange(rows), rows - jnp.arange(rows))
-    coloured = jnp.maximum(k, 1).astype(exponent.dtype) ** (-exponent / 2)
-    amplitude = jnp.where(k > 0, coloured, jnp.where(exponent == 0, 1, 0))
-    mean_power = jnp.mean(amplitude**2)
-    # A single row has only the DC term, so a coloured series over it is 0.
-    return amplitude[: rows // 2 + 1] / jnp.sqrt(jnp.where(mean_power > 0, mean_power, 1))

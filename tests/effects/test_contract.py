@@ -116,7 +116,7 @@ def test_same_key_same_draw(effect):
 @each_effect
 def test_jit_is_eager(effect):
     model = model_of(effect)
-    capture = Capture(jnp.asarray(0.1), SHAPE[1:], "RGGB", "rolling")
+    capture = Capture(jnp.asarray(0.1), SHAPE[1:], "RGGB", "rolling", jax.random.key(9))
 
     def draw(effect):
         return effect.sample(jnp.asarray(signal()), capture, key=KEY)
