@@ -4,12 +4,36 @@ from __future__ import annotations
 
 from hsnoise.effects._base import AbstractEffect, Capture, Parameter, ParameterSpec, Stage, param
 from hsnoise.effects.adc import ADC
+from hsnoise.effects.amplifier_glow import AmplifierGlow
+from hsnoise.effects.black_clamp import BlackClamp
 from hsnoise.effects.black_level import BlackLevel
+from hsnoise.effects.column_fixed_pattern import ColumnFixedPattern
+from hsnoise.effects.column_noise import ColumnNoise
+from hsnoise.effects.cosmic_rays import CosmicRays
+from hsnoise.effects.crosstalk import Crosstalk
 from hsnoise.effects.dark_current import DarkCurrent
+from hsnoise.effects.dark_current_drift import DarkCurrentDrift
+from hsnoise.effects.dark_signal_nonuniformity import DarkSignalNonuniformity
+from hsnoise.effects.frame_offset import FrameOffset
 from hsnoise.effects.gain import Gain
+from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
+from hsnoise.effects.hot_pixels import HotPixels
+from hsnoise.effects.image_lag import ImageLag
+from hsnoise.effects.missing_codes import MissingCodes
+from hsnoise.effects.nonlinearity import Nonlinearity
+from hsnoise.effects.odd_even_pattern import OddEvenPattern
+from hsnoise.effects.periodic_banding import PeriodicBanding
+from hsnoise.effects.photo_response_nonuniformity import PhotoResponseNonuniformity
+from hsnoise.effects.random_telegraph_noise import RandomTelegraphNoise
 from hsnoise.effects.read_noise import ReadNoise
+from hsnoise.effects.read_noise_nonuniformity import ReadNoiseNonuniformity
+from hsnoise.effects.readout_bandwidth import ReadoutBandwidth
+from hsnoise.effects.row_fixed_pattern import RowFixedPattern
 from hsnoise.effects.row_gain import RowGain
+from hsnoise.effects.row_noise import RowNoise
+from hsnoise.effects.shared_row_gain import SharedRowGain
 from hsnoise.effects.shot_noise import ShotNoise
+from hsnoise.effects.tap_offsets import TapOffsets
 
 EFFECTS: tuple[type[AbstractEffect], ...] = (
     ShotNoise,
@@ -19,21 +43,69 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     Gain,
     BlackLevel,
     ADC,
+    SharedRowGain,
+    RowNoise,
+    ColumnNoise,
+    RowFixedPattern,
+    ColumnFixedPattern,
+    FrameOffset,
+    DarkSignalNonuniformity,
+    PhotoResponseNonuniformity,
+    HotPixels,
+    AmplifierGlow,
+    DarkCurrentDrift,
+    RandomTelegraphNoise,
+    HeavyTailedReadNoise,
+    ReadNoiseNonuniformity,
+    PeriodicBanding,
+    Crosstalk,
+    ReadoutBandwidth,
+    ImageLag,
+    OddEvenPattern,
+    TapOffsets,
+    MissingCodes,
+    CosmicRays,
+    BlackClamp,
+    Nonlinearity,
 )
 
 __all__ = [
     "ADC",
-    "EFFECTS",
     "AbstractEffect",
+    "AmplifierGlow",
+    "BlackClamp",
     "BlackLevel",
     "Capture",
+    "ColumnFixedPattern",
+    "ColumnNoise",
+    "CosmicRays",
+    "Crosstalk",
     "DarkCurrent",
+    "DarkCurrentDrift",
+    "DarkSignalNonuniformity",
+    "EFFECTS",
+    "FrameOffset",
     "Gain",
+    "HeavyTailedReadNoise",
+    "HotPixels",
+    "ImageLag",
+    "MissingCodes",
+    "Nonlinearity",
+    "OddEvenPattern",
     "Parameter",
     "ParameterSpec",
+    "PeriodicBanding",
+    "PhotoResponseNonuniformity",
+    "RandomTelegraphNoise",
     "ReadNoise",
+    "ReadNoiseNonuniformity",
+    "ReadoutBandwidth",
+    "RowFixedPattern",
     "RowGain",
+    "RowNoise",
+    "SharedRowGain",
     "ShotNoise",
     "Stage",
+    "TapOffsets",
     "param",
 ]

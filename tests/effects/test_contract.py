@@ -17,14 +17,38 @@ from hsnoise.effects import (
     ADC,
     EFFECTS,
     AbstractEffect,
+    AmplifierGlow,
+    BlackClamp,
     BlackLevel,
     Capture,
+    ColumnFixedPattern,
+    ColumnNoise,
+    CosmicRays,
+    Crosstalk,
     DarkCurrent,
+    DarkCurrentDrift,
+    DarkSignalNonuniformity,
+    FrameOffset,
     Gain,
+    HeavyTailedReadNoise,
+    HotPixels,
+    ImageLag,
+    MissingCodes,
+    Nonlinearity,
+    OddEvenPattern,
+    PeriodicBanding,
+    PhotoResponseNonuniformity,
+    RandomTelegraphNoise,
     ReadNoise,
+    ReadNoiseNonuniformity,
+    ReadoutBandwidth,
+    RowFixedPattern,
     RowGain,
+    RowNoise,
+    SharedRowGain,
     ShotNoise,
     Stage,
+    TapOffsets,
 )
 from hsnoise.model import NoiseModel, sample
 
@@ -41,12 +65,51 @@ EXAMPLES = [
     Gain([1.5, 1.2, 1.3]),
     BlackLevel([64.0, 65.0, 66.0]),
     ADC(4095),
+    SharedRowGain(0.1, 1.0),
+    RowNoise(2.0, 1.0),
+    ColumnNoise(2.0, 1.0),
+    RowFixedPattern(2.0),
+    ColumnFixedPattern(2.0),
+    FrameOffset(1.0),
+    DarkSignalNonuniformity(2.0),
+    PhotoResponseNonuniformity(0.1),
+    HotPixels(0.2, 500.0),
+    AmplifierGlow(200.0, 0.3),
+    DarkCurrentDrift(60.0),
+    RandomTelegraphNoise(0.5, 8.0, 0.4),
+    HeavyTailedReadNoise(6.0),
+    ReadNoiseNonuniformity(0.4),
+    PeriodicBanding(2.0, 0.13),
+    Crosstalk(0.03),
+    ReadoutBandwidth(0.1),
+    ImageLag(0.1),
+    OddEvenPattern(1.0, 0.02),
+    TapOffsets(2.0, taps=3),
+    MissingCodes(2.6),
+    CosmicRays(5e6, 300.0),
+    BlackClamp([70.0, 60.0, 65.0]),
+    Nonlinearity(1e-3),
 ]
+# Effects that draw nothing, and those that act through the read noise that another effect draws.
+DETERMINISTIC = (
+    Gain
+    | BlackLevel
+    | ADC
+    | Crosstalk
+    | ReadoutBandwidth
+    | ImageLag
+    | OddEvenPattern
+    | MissingCodes
+    | BlackClamp
+    | Nonlinearity
+)
+SHAPE_READ_NOISE = HeavyTailedReadNoise | ReadNoiseNonuniformity
 each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: effect.name)
 
 
 def model_of(effect):
-    return NoiseModel([effect], cfa="RGGB", shutter="rolling", exposure_s=0.1)
+    effects = [effect, ReadNoise(3.5)] if isinstance(effect, SHAPE_READ_NOISE) else [effect]
+    return NoiseModel(effects, cfa="RGGB", shutter="rolling", exposure_s=0.1)
 
 
 def signal():
@@ -109,8 +172,7 @@ def test_same_key_same_draw(effect):
     other = sample(jax.random.key(8), signal(), model)
     assert first.shape == SHAPE
     np.testing.assert_array_equal(first, again)
-    deterministic = isinstance(effect, Gain | BlackLevel | ADC)
-    assert np.array_equal(first, other) == deterministic
+    assert np.array_equal(first, other) == isinstance(effect, DETERMINISTIC)
 
 
 @each_effect

@@ -1,0 +1,40 @@
+"""Glow of the output amplifier: dark current that rises toward a corner."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+
+
+class AmplifierGlow(AbstractEffect):
+    """Extra electrons, Poisson(rate * exposure * exp(-d / scale)), at distance d from the glowing spot.
+
+    Transistors in saturation emit infrared light that the neighbouring pixels see. Distances are in units of the
+    frame's diagonal; the spot lies anywhere in the frame, by default in the corner of the last row and column.
+
+    In dark frames: a smooth brightening toward a corner or edge that grows in proportion to exposure, with its shot
+    noise.
+
+    Reference: Janesick, *Scientific Charge-Coupled Devices*, SPIE 2001 (luminescence).
+    """
+
+    name: ClassVar[str] = "amplifier_glow"
+    stage: ClassVar[Stage] = Stage.ELECTRONS
+    rate: Scalar = param("e-/s", low=0, doc="electrons of a pixel in a second where the glow is brightest")
+    scale: Scalar = param("1", low=0.01, doc="distance over which the glow falls by e, in diagonals of the frame")
+    row: Scalar = param("1", low=0, high=1, default=1.0, doc="row of the brightest spot: 0 the first, 1 the last")
+    column: Scalar = param("1", low=0, high=1, default=1.0, doc="column of the brightest spot: 0 the first, 1 the last")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        last_row, last_column = capture.shape[0] - 1, capture.shape[1] - 1
+        down = jnp.arange(last_row + 1, dtype=signal.dtype) - self.row * last_row
+        right = jnp.arange(last_column + 1, dtype=signal.dtype) - self.column * last_column
+        squared = (down[:, None] ** 2 + right[None] ** 2) / max(last_row**2 + last_column**2, 1)
+        # The small term keeps the derivative finite in the spot itself.
+        distance = jnp.sqrt(squared + 1e-12)
+        mean = self.rate * capture.exposure_s * jnp.exp(-distance / self.scale)
+        return signal + draw_poisson(key, jnp.broadcast_to(mean[None], signal.shape))

@@ -1,0 +1,28 @@
+"""The camera subtracts (part of) the mean of the dark current."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from hsnoise._types import Frames, PerChannel, RandomKey
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class BlackClamp(AbstractEffect):
+    """The camera subtracts rate * exposure DN, estimated from pixels that see no light.
+
+    Optically black pixels collect dark electrons as the others do; subtracting their mean keeps the black level where
+    it belongs, but not the shot noise. The clamp is complete where `rate` is gain times dark current.
+
+    In dark frames: the mean does not follow the exposure (or follows it too little), the variance does. From darks
+    alone it is told from another gain and dark current only by skewness, clipping and row gains; a flat decides.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007 (optical black, clamping).
+    """
+
+    name: ClassVar[str] = "black_clamp"
+    stage: ClassVar[Stage] = Stage.BLACK
+    rate: PerChannel = param("DN/s", low=0, per_channel=True, doc="dark level that the camera subtracts")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        return signal - capture.per_pixel(self.rate * capture.exposure_s)

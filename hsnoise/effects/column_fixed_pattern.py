@@ -1,0 +1,30 @@
+"""Fixed pattern of columns: an additive offset of each column, the same in all frames."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class ColumnFixedPattern(AbstractEffect):
+    """Offset of each column, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
+
+    Each column has its own amplifier and converter, whose offset stays.
+
+    In dark frames: vertical streaks that stay when frames are averaged.
+
+    Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU of columns).
+    """
+
+    name: ClassVar[str] = "column_fixed_pattern"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        _, _, columns = signal.shape
+        pattern = jax.random.normal(capture.fixed_key(self.name), (1, 1, columns), signal.dtype)
+        return signal + self.sigma * pattern

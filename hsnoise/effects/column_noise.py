@@ -1,0 +1,33 @@
+"""Column noise: an additive offset of each column, new in each frame."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
+
+
+class ColumnNoise(AbstractEffect):
+    """Offset of each column, e-, new in each frame, the same for all colours of the column.
+
+    Column amplifiers that sample their reference once a frame hold its noise for all rows. One normal series runs
+    over all sensor columns, white or with power k^-exponent (k cycles per frame, no DC term, as in
+    `coloured_normal`).
+
+    In dark frames: vertical streaks that change from frame to frame, equally strong in all colours and exposures.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+
+    name: ClassVar[str] = "column_noise"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
+    exponent: Scalar = param("1", default=0.0, doc="power falls as column frequency to minus this: 0 white, 1 is 1/f")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        frames, _, columns = signal.shape
+        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype)
+        return signal + self.sigma * jnp.swapaxes(series, 1, 2)

@@ -1,0 +1,35 @@
+"""Cosmic rays: rare large hits in single frames."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class CosmicRays(AbstractEffect):
+    """Hits of single pixels, Poisson in space and time, each with an exponentially distributed charge.
+
+    Muons and decays in the sensor's surroundings leave some 80 electrons for each micrometre of silicon they cross.
+    Tracks over several pixels are not described. Two hits of one pixel in one exposure count as one.
+
+    In dark frames: bright single pixels, in other places in each frame, their number in proportion to exposure.
+
+    Reference: Groom, "Cosmic rays and other nonsense in astronomical CCD imagers", Exp. Astron. 14, 2002.
+    """
+
+    name: ClassVar[str] = "cosmic_rays"
+    stage: ClassVar[Stage] = Stage.ELECTRONS
+    rate: Scalar = param("1/(Mpixel s)", low=0, doc="hits of a million pixels in a second")
+    charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        where, how_much = jax.random.split(key)
+        probability = -jnp.expm1(-1e-6 * self.rate * capture.exposure_s)
+        hit = jax.random.uniform(where, signal.shape, signal.dtype) < probability
+        charge = jnp.round(self.charge * jax.random.exponential(how_much, signal.shape, signal.dtype))
+        return signal + jnp.where(hit, charge, 0)

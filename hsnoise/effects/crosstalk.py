@@ -1,0 +1,37 @@
+"""Signal shared between neighbouring pixels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class Crosstalk(AbstractEffect):
+    """Each of the four neighbours of a pixel gets `fraction` of its electrons: (1 - 4 f) x + f (sum of neighbours).
+
+    Capacitance between the sense nodes couples pixels after their charge was collected, so that their shot noise is
+    shared, too: their variance is (1 - 4 f)^2 + 4 f^2 of what it was. (Electrons that diffuse before they are collected are
+    independent Poisson counts again: a blur of the light, nothing in dark frames.) Nothing is lost: what would leave
+    the frame stays in the pixel. In a Bayer sensor neighbours have other colours.
+
+    In dark frames: the noise of the four neighbours is correlated, in proportion to the shot noise, while the mean
+    stays: the slope of the photon transfer line is less than the gain.
+
+    Reference: Moore, Ninkov, Forrest, "Quantum efficiency overestimation and deterministic cross talk resulting from
+    interpixel capacitance", Opt. Eng. 45, 2006.
+    """
+
+    name: ClassVar[str] = "crosstalk"
+    stage: ClassVar[Stage] = Stage.COUPLING
+    fraction: Scalar = param("1", low=0, high=0.25, doc="part of a pixel's electrons that each neighbour gets")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        padded = jnp.pad(signal, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        inside = slice(1, -1)
+        above, below = padded[:, :-2, inside], padded[:, 2:, inside]
+        left, right = padded[:, inside, :-2], padded[:, inside, 2:]
+        return signal + self.fraction * (above + below + left + right - 4 * signal)

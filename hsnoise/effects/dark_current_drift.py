@@ -1,0 +1,33 @@
+"""Dark current that rises in the course of the capture."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+
+
+class DarkCurrentDrift(AbstractEffect):
+    """Extra dark electrons, Poisson(slope * exposure * f), in frame f = 0, 1, ...
+
+    The sensor warms up while it records, and dark current doubles about every 6 to 8 degrees. To first order the rate
+    grows in proportion to the number of frames since the start of each exposure series. Only warming is described:
+    dark current that falls would need a negative number of electrons where there are none; there, the first frames
+    are the odd ones.
+
+    In dark frames: the frame mean and its shot noise rise from frame to frame, in proportion to exposure.
+
+    Reference: Widenhorn et al., "Temperature dependence of dark current in a CCD", Proc. SPIE 4669, 2002.
+    """
+
+    name: ClassVar[str] = "dark_current_drift"
+    stage: ClassVar[Stage] = Stage.ELECTRONS
+    slope: Scalar = param("e-/s/frame", low=0, doc="growth of the dark current from one frame to the next")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        frame = jnp.arange(len(signal), dtype=signal.dtype)[:, None, None]
+        mean = self.slope * capture.exposure_s * frame
+        return signal + draw_poisson(key, jnp.broadcast_to(mean, signal.shape))

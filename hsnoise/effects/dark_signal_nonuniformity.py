@@ -1,0 +1,29 @@
+"""Offset of each pixel, the same in all frames."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class DarkSignalNonuniformity(AbstractEffect):
+    """Offset of each pixel, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
+
+    Thresholds of the pixels' transistors differ. What grows with exposure instead is `hot_pixels`.
+
+    In dark frames: a grain that stays when frames are averaged, equally strong in all exposures.
+
+    Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU).
+    """
+
+    name: ClassVar[str] = "dark_signal_nonuniformity"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over pixels")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        pattern = jax.random.normal(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
+        return signal + self.sigma * pattern

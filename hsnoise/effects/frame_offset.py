@@ -1,0 +1,28 @@
+"""Flicker of the black level from frame to frame."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class FrameOffset(AbstractEffect):
+    """Offset of a whole frame, Normal(0, sigma^2) in e-, independent between frames.
+
+    The reference of the black level is sampled once a frame, or the black clamp averages too few pixels.
+
+    In dark frames: the mean of frames scatters by more than the noise of their pixels allows, in all colours alike.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+
+    name: ClassVar[str] = "frame_offset"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over frames")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        return signal + self.sigma * jax.random.normal(key, (len(signal), 1, 1), signal.dtype)

@@ -1,0 +1,32 @@
+"""A frame keeps part of the previous one."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class ImageLag(AbstractEffect):
+    """Frame f holds (1 - fraction) of its own electrons and `fraction` of those of frame f - 1.
+
+    The transfer gate does not empty the photodiode, and the rest is read with the next frame. Before the first frame
+    the sensor saw the same as in the first one, which therefore stays as it is.
+
+    In dark frames: consecutive frames are correlated pixel by pixel, in proportion to the shot noise. Moving light
+    leaves trails.
+
+    Reference: Fossum, Hondongwa, "A review of the pinned photodiode for CCD and CMOS image sensors", IEEE J. Electron
+    Devices Soc. 2, 2014.
+    """
+
+    name: ClassVar[str] = "image_lag"
+    stage: ClassVar[Stage] = Stage.COUPLING
+    fraction: Scalar = param("1", low=0, high=1, doc="part of the electrons that stays for the next frame")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        previous = jnp.concatenate([signal[:1], signal[:-1]])
+        return signal + self.fraction * (previous - signal)

@@ -1,0 +1,39 @@
+"""Digital gain: some codes never occur."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._types import Counts, Frames, RandomKey, Scalar
+from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage, param
+
+
+class MissingCodes(AbstractEffect):
+    """The converter works in steps of `gain` DN, and a digital gain stretches its codes: round(gain round(y / gain)).
+
+    Cameras reach their highest sensitivities by multiplying counts. About one in `gain` codes is left; the mean
+    stays, because the gain of the model is that of the whole camera. Add it after `adc`, so that it acts on counts.
+    With gain 1, counts stay as they are.
+
+    In dark frames: gaps at regular distances in the histogram of counts, alike in all exposures.
+
+    Attributes:
+        white_level_dn: largest count, DN, to which stretched codes are clipped; None for that of the integer type.
+
+    Reference: Martinec, "Noise, dynamic range and bit depth in digital SLRs", University of Chicago, 2008.
+    """
+
+    name: ClassVar[str] = "missing_codes"
+    stage: ClassVar[Stage] = Stage.DIGITAL
+    gain: Scalar = param("1", low=1, doc="digital gain: distance of two codes, DN, before the last rounding")
+    white_level_dn: float | None = eqx.field(static=True, default=None)
+
+    def sample(self, signal: Frames | Counts, capture: Capture, *, key: RandomKey) -> Frames | Counts:
+        stretched = jnp.round(jnp.round(signal.astype(self.gain.dtype) / self.gain) * self.gain)
+        limit = np.iinfo(np.uint16).max if signal.dtype == jnp.uint16 else LARGEST_UINT32
+        white = limit if self.white_level_dn is None else min(self.white_level_dn, limit)
+        return jnp.minimum(stretched, white).astype(signal.dtype)

@@ -1,0 +1,34 @@
+"""The response bends with signal."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class Nonlinearity(AbstractEffect):
+    """Signal x of more than 0 electrons reads x - curvature x^2.
+
+    The capacitance of the sense node grows as it fills, and the source follower leaves its linear range. Positive
+    curvature is a response that falls behind; it ends level at its summit, x = 1 / (2 curvature). It acts before the
+    gain, on the signal with its read noise.
+
+    In dark frames: next to nothing, unless long exposures collect many electrons; flats show means that fall behind
+    the light, and a photon transfer curve that bends.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007 (V/V and V/e- nonlinearity).
+    """
+
+    name: ClassVar[str] = "nonlinearity"
+    stage: ClassVar[Stage] = Stage.READOUT
+    curvature: Scalar = param("1/e-", doc="relative loss of response for each electron of signal")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        bends = self.curvature > 0
+        summit = jnp.where(bends, 0.5 / jnp.where(bends, self.curvature, 1), jnp.inf)
+        positive = jnp.clip(signal, 0, summit)
+        return jnp.minimum(signal, summit) - self.curvature * positive**2

@@ -1,0 +1,35 @@
+"""Two readout chains with different offsets and gains."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class OddEvenPattern(AbstractEffect):
+    """Two readout chains take turns: alternating columns, in a Bayer sensor alternating pairs of columns.
+
+    Amplifiers above and below the sensor are never quite equal. The second chain reads `offset` more electrons and
+    has a gain larger by `gain_mismatch` than the first; each differs by half of it from the mean of both, which stays
+    as it is. Pairs of columns, because each chain must read all colours.
+
+    In dark frames: a fine vertical grating, the same in all frames; with a gain mismatch its contrast grows with
+    exposure, and the noise of the columns alternates.
+
+    Reference: EMVA Standard 1288, release 4.0, 2021 (spectrograms of periodic nonuniformity).
+    """
+
+    name: ClassVar[str] = "odd_even_pattern"
+    stage: ClassVar[Stage] = Stage.READOUT
+    offset: Scalar = param("e-", doc="second chain minus first")
+    gain_mismatch: Scalar = param("1", low=-1, high=1, default=0.0, doc="relative gain, second chain minus first")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        width = 1 if capture.cfa == "mono" else 2
+        chain = (jnp.arange(capture.shape[1]) // width) % 2
+        half = (chain.astype(signal.dtype) - 0.5)[None, None]
+        return signal * (1 + half * self.gain_mismatch) + half * self.offset

@@ -1,0 +1,36 @@
+"""Random telegraph noise: a few pixels jump between two levels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class RandomTelegraphNoise(AbstractEffect):
+    """A fraction of the pixels, the same in all frames, reads `amplitude` more electrons in its high state.
+
+    A trap in the oxide of the pixel's source follower catches and frees a single carrier. Every pixel has such a trap
+    with probability `fraction`; its state is new in each frame (traps are faster than the frame rate), high with
+    probability `duty`. The low level is the pixel's ordinary one, so the pixel's mean rises by amplitude * duty.
+
+    In dark frames: histograms over time of single pixels have two peaks; variance over time has a far tail over
+    pixels, the same in all exposures.
+
+    Reference: Wang, Rao, Mierop, Theuwissen, "Random telegraph signal in CMOS image sensor pixels", IEDM 2006.
+    """
+
+    name: ClassVar[str] = "random_telegraph_noise"
+    stage: ClassVar[Stage] = Stage.READ
+    fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that jump")
+    amplitude: Scalar = param("e-", low=0, doc="distance of the two levels")
+    duty: Scalar = param("1", low=0, high=1, default=0.5, doc="probability of the high level")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        where = jax.random.uniform(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
+        high = jax.random.uniform(key, signal.shape, signal.dtype) < self.duty
+        return signal + jnp.where((where < self.fraction) & high, self.amplitude, 0)

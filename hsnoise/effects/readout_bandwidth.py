@@ -1,0 +1,32 @@
+"""A pixel keeps part of the previous one along the readout."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class ReadoutBandwidth(AbstractEffect):
+    """Pixel j of a row reads (1 - fraction) of itself and `fraction` of pixel j - 1, read just before it.
+
+    The output amplifier has not settled when the next pixel is sampled. It acts on the read noise, too; in a Bayer
+    sensor the previous pixel has another colour. The first pixel of a row follows a level like its own, so means
+    stay as they are.
+
+    In dark frames: noise of neighbours along the row is correlated and its variance (1 - f)^2 + f^2 of what it was, at
+    all exposures; noise of neighbours along the column is not correlated.
+
+    Reference: Janesick, *Scientific Charge-Coupled Devices*, SPIE 2001 (settling of the video signal).
+    """
+
+    name: ClassVar[str] = "readout_bandwidth"
+    stage: ClassVar[Stage] = Stage.READOUT
+    fraction: Scalar = param("1", low=0, high=1, doc="part of the previous pixel in a pixel's reading")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        previous = jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)
+        return signal + self.fraction * (previous - signal)

@@ -1,0 +1,31 @@
+"""Row noise: an additive offset of each row, new in each frame."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
+
+
+class RowNoise(AbstractEffect):
+    """Offset of each row, e-, new in each frame, the same for all colours of the row.
+
+    All pixels of a row are sampled at once, so noise of supplies and references in that moment is common to them;
+    circuits know no colours. One normal series runs over all sensor rows, white or with power k^-exponent (k cycles
+    per frame, no DC term, as in `coloured_normal`); slow noise of the supplies is 1/f. It follows the time of readout,
+    so the shutter does not matter.
+
+    In dark frames: horizontal streaks that change from frame to frame, equally strong in all colours and exposures.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007.
+    """
+
+    name: ClassVar[str] = "row_noise"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over rows")
+    exponent: Scalar = param("1", default=0.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        frames, rows, _ = signal.shape
+        return signal + self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)

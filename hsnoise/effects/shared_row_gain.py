@@ -1,0 +1,35 @@
+"""Gain fluctuations of a row that are common to its colours."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
+
+
+class SharedRowGain(AbstractEffect):
+    """Gain max(1 + sigma x, 0) of each row, one series x[frame, row] for all colours.
+
+    The reference voltage of the converters fluctuates while a row is read, whatever its colours. The series runs over
+    all sensor rows with power k^-exponent (no DC term, as in `coloured_normal`); with a global shutter it is white,
+    as in the paper.
+
+    In dark frames: streaks as of `row_gain`, but correlated between the colours of a row.
+
+    Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
+    ICCV 2019 (which takes colours as independent).
+    """
+
+    name: ClassVar[str] = "shared_row_gain"
+    stage: ClassVar[Stage] = Stage.GAIN
+    sigma: Scalar = param("1", low=0, doc="standard deviation of the common gain over rows")
+    exponent: Scalar = param("1", default=1.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        frames, rows, _ = signal.shape
+        exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
+        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype)
+        return signal * jnp.maximum(1 + self.sigma * series, 0)

@@ -1,0 +1,42 @@
+"""Blocks of columns that different output taps read."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class TapOffsets(AbstractEffect):
+    """Each of `taps` equal blocks of columns has its own offset, Normal(0, sigma^2) in e-, the same in all frames.
+
+    Fast sensors read blocks of columns through outputs of their own, whose offsets are trimmed only so well. The mean
+    of so few offsets is not zero; a fit sees it as part of the black level.
+
+    In dark frames: vertical panels with sharp edges, alike in all exposures.
+
+    Attributes:
+        taps: number of outputs, at least 2.
+
+    Reference: EMVA Standard 1288, release 4.0, 2021 (nonuniformity of columns).
+    """
+
+    name: ClassVar[str] = "tap_offsets"
+    stage: ClassVar[Stage] = Stage.READ
+    sigma: Scalar = param("e-", low=0, doc="standard deviation over taps")
+    taps: int = eqx.field(static=True, default=4)
+
+    def __check_init__(self):
+        if not isinstance(self.taps, int) or self.taps < 2:
+            raise ValueError(f"tap_offsets.taps: expected a whole number of at least 2, got {self.taps!r}.")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        columns = capture.shape[1]
+        tap = jnp.arange(columns) * self.taps // columns
+        offsets = jax.random.normal(capture.fixed_key(self.name), (self.taps,), signal.dtype)
+        return signal + self.sigma * offsets[tap][None, None]
