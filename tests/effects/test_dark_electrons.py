@@ -1,0 +1,85 @@
+"""Laws of the dark electrons that are not alike in all pixels and frames: hot pixels, glow, drift, cosmic rays."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from hsnoise.effects import AmplifierGlow, CosmicRays, DarkCurrentDrift, HotPixels
+from hsnoise.model import NoiseModel, sample_dark
+
+KEY = jax.random.key(31)
+P_VALUE = 1e-5
+
+
+def darks(effect, frames, shape, exposure_s=0.5):
+    model = NoiseModel([effect], cfa="mono", shutter="rolling", exposure_s=0.05)
+    drawn = np.asarray(sample_dark(KEY, frames, shape, model, exposure_s=exposure_s))
+    assert np.array_equal(drawn, np.round(drawn)) and drawn.min() >= 0
+    return drawn
+
+
+def poisson_z(drawn, mean):
+    """Sum and chi-square of counts against independent Poisson counts of these means, both as standard normals."""
+    mean = np.broadcast_to(mean, drawn.shape)
+    squares = np.where(mean > 0, (drawn - mean) ** 2 / np.maximum(mean, 1e-300), 1)
+    spread = np.sqrt(np.sum(np.where(mean > 0, 2 + 1 / np.maximum(mean, 1e-300), 0)))
+    return (drawn - mean).sum() / np.sqrt(mean.sum()), (squares - 1).sum() / spread
+
+
+def test_hot_pixels_are_few_exponential_and_poisson():
+    drawn = darks(HotPixels(0.05, 4e4), 20, (200, 200))
+    means = drawn.mean(0)
+    hot = means > 0
+    # Hot pixels that stay at zero electrons in all frames: 1 in 20 * 2e4, none to speak of.
+    assert abs(hot.mean() - 0.05) < 5 * np.sqrt(0.05 * 0.95 / hot.size)
+    assert stats.kstest(means[hot] / 2e4, "expon").pvalue > P_VALUE
+    ratio = drawn.var(0, ddof=1)[hot] / means[hot]
+    assert abs(ratio.mean() - 1) < 5 * np.sqrt(2 / 19 / hot.sum())
+    longer = darks(HotPixels(0.05, 4e4), 20, (200, 200), exposure_s=1.0).mean(0)
+    np.testing.assert_array_equal(longer > 0, hot)
+    np.testing.assert_allclose(longer.sum() / means.sum(), 2, atol=0.01)
+
+
+@pytest.mark.parametrize("corner", [None, (0.0, 0.0), (0.0, 1.0), (0.5, 0.25)])
+def test_glow_falls_exponentially_from_its_spot(corner):
+    rows, columns, frames = 31, 41, 50
+    drawn = darks(AmplifierGlow(60.0, 0.3, *(corner or ())), frames, (rows, columns))
+    spot = corner or (1.0, 1.0)
+    i, j = np.mgrid[:rows, :columns]
+    distance = np.hypot(i - spot[0] * (rows - 1), j - spot[1] * (columns - 1)) / np.hypot(rows - 1, columns - 1)
+    expected = 60.0 * 0.5 * np.exp(-distance / 0.3)
+    assert np.max(np.abs(poisson_z(drawn, expected))) < 5
+    z = (drawn.mean(0) - expected) * np.sqrt(frames / expected)
+    assert stats.chi2.sf(np.sum(z**2), z.size) > P_VALUE
+
+
+def test_drift_grows_from_frame_to_frame():
+    drawn = darks(DarkCurrentDrift(1.5), 6, (100, 100))
+    assert np.all(drawn[0] == 0)
+    for f in range(1, 6):
+        assert np.max(np.abs(poisson_z(drawn[f], 1.5 * 0.5 * f))) < 5
+
+
+def test_cosmic_rays_are_rare_new_and_exponential():
+    frames, shape, per_pixel = 40, (100, 100), 2000e-6 * 0.5
+    drawn = darks(CosmicRays(2000.0, 900.0), frames, shape)
+    hit = drawn > 0
+    # One in 1800 hits rounds to no electron.
+    assert abs(hit.sum() - per_pixel * hit.size) < 5 * np.sqrt(per_pixel * hit.size)
+    charge = drawn[hit] + np.random.default_rng(0).uniform(-0.5, 0.5, hit.sum())
+    assert stats.kstest(charge / 900, "expon").pvalue > P_VALUE
+    assert hit.sum(0).max() <= 2
+    counts = hit.sum((1, 2))
+    assert stats.chi2.sf(np.sum((counts - counts.mean()) ** 2) / counts.mean(), frames - 1) > P_VALUE
+    assert np.all(darks(CosmicRays(2000.0, 900.0), 2, shape, exposure_s=0.0) == 0)
+
+
+def test_glow_has_a_finite_derivative_in_its_spot():
+    effect = AmplifierGlow(60.0, 0.3)
+    model = NoiseModel([effect], cfa="mono", shutter="rolling", exposure_s=0.05)
+    gradient = jax.grad(lambda m: jnp.sum(sample_dark(KEY, 1, (5, 5), m)))(model)
+    assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient))

@@ -1,0 +1,105 @@
+"""Laws of the offsets of rows, columns, frames, pixels and taps: size, distribution, which pixels share one."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from hsnoise.effects import (
+    ColumnFixedPattern,
+    ColumnNoise,
+    DarkSignalNonuniformity,
+    FrameOffset,
+    PeriodicBanding,
+    RowFixedPattern,
+    RowNoise,
+    TapOffsets,
+)
+from hsnoise.model import NoiseModel, sample_dark
+
+KEY = jax.random.key(29)
+P_VALUE = 1e-5
+
+
+def darks(effect, frames, shape, cfa="RGGB", exposure_s=0.05):
+    model = NoiseModel([effect], cfa=cfa, shutter="rolling", exposure_s=0.05)
+    return np.asarray(sample_dark(KEY, frames, shape, model, exposure_s=exposure_s))
+
+
+# Which of [frame, row, column] an offset depends on; it is the same along the others, whatever the colour.
+@pytest.mark.parametrize(
+    ("effect", "depends", "shape"),
+    [
+        (RowNoise(2.0), (True, True, False), (100, 40, 4)),
+        (ColumnNoise(2.0), (True, False, True), (100, 4, 40)),
+        (RowFixedPattern(2.0), (False, True, False), (2, 4000, 4)),
+        (ColumnFixedPattern(2.0), (False, False, True), (2, 4, 4000)),
+        (FrameOffset(2.0), (True, False, False), (4000, 2, 2)),
+        (DarkSignalNonuniformity(2.0), (False, True, True), (2, 60, 60)),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_offsets_are_normal_and_shared_by_the_right_pixels(effect, depends, shape):
+    drawn = darks(effect, shape[0], shape[1:])
+    own = drawn[tuple(slice(None) if varies else slice(1) for varies in depends)]
+    np.testing.assert_array_equal(drawn, np.broadcast_to(own, shape))
+    assert stats.kstest(own.ravel() / 2, "norm").pvalue > P_VALUE
+    assert abs(own.var() / 4 - 1) < 5 * np.sqrt(2 / own.size)
+    for axis in np.flatnonzero(depends):  # neighbours are independent
+        left, right = np.take(own, range(own.shape[axis] - 1), axis), np.take(own, range(1, own.shape[axis]), axis)
+        assert abs(np.mean(left * right)) / 4 < 5 / np.sqrt(left.size)
+    np.testing.assert_array_equal(darks(effect, *[shape[0], shape[1:]], exposure_s=1.0), drawn)
+
+
+@pytest.mark.parametrize(("effect", "axis"), [(RowNoise(2.0, 1.0), 1), (ColumnNoise(2.0, 1.0), 2)])
+def test_coloured_offsets_have_the_spectrum(effect, axis):
+    frames, n = 400, 64
+    drawn = darks(effect, frames, (n, 2) if axis == 1 else (2, n))
+    series = drawn[:, :, 0] if axis == 1 else drawn[:, 0]
+    power = np.abs(np.fft.rfft(series) / n) ** 2
+    k = np.minimum(np.arange(n), n - np.arange(n))
+    expected = np.where(k > 0, 1 / np.maximum(k, 1), 0)
+    expected = 4 * expected / expected.sum()
+    np.testing.assert_allclose(power[:, 0], 0, atol=1e-20)
+    relative = power[:, 1 : n // 2] / expected[1 : n // 2]
+    assert stats.kstest(relative.ravel(), "expon").pvalue > P_VALUE
+    squares = np.mean(series**2, axis=1)
+    assert abs(squares.mean() - 4) < 5 * squares.std() / np.sqrt(frames)
+
+
+@pytest.mark.parametrize(("columns", "taps"), [(64, 4), (64, 2), (50, 3)])
+def test_taps_are_blocks_of_columns(columns, taps):
+    drawn = darks(TapOffsets(2.0, taps), 2, (4, columns))
+    np.testing.assert_array_equal(drawn, np.broadcast_to(drawn[:1, :1], drawn.shape))
+    widths = np.diff(np.concatenate([[0], np.flatnonzero(np.diff(drawn[0, 0])) + 1, [columns]]))
+    assert len(widths) == taps and np.ptp(widths) <= 1
+
+
+def test_tap_offsets_are_normal():
+    drawn = darks(TapOffsets(2.0, taps=2000), 1, (2, 2000))[0, 0]
+    assert stats.kstest(drawn / 2, "norm").pvalue > P_VALUE
+
+
+@pytest.mark.parametrize("axis", ["row", "column"])
+def test_banding_is_a_sinusoid_of_new_phase(axis):
+    frames, n, frequency = 300, 40, 0.13
+    drawn = darks(PeriodicBanding(3.0, frequency, axis), frames, (n, 6) if axis == "row" else (6, n))
+    drawn = drawn if axis == "row" else drawn.swapaxes(1, 2)
+    np.testing.assert_array_equal(drawn, np.broadcast_to(drawn[:, :, :1], drawn.shape))
+    turns = 2 * np.pi * frequency * np.arange(n)
+    basis = np.stack([np.sin(turns), np.cos(turns)], 1)
+    solution, residual, *_ = np.linalg.lstsq(basis, drawn[:, :, 0].T, rcond=None)
+    np.testing.assert_allclose(residual, 0, atol=1e-20)
+    np.testing.assert_allclose(np.hypot(*solution), 3.0, rtol=1e-10)
+    phase = np.arctan2(solution[1], solution[0]) / (2 * np.pi) % 1
+    assert stats.kstest(phase, "uniform").pvalue > P_VALUE
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ValueError, match=r"periodic_banding.axis: expected 'row' or 'column', got 'x'"):
+        PeriodicBanding(1.0, 0.1, "x")
+    for taps in (1, 2.5):
+        with pytest.raises(ValueError, match=r"tap_offsets.taps: expected a whole number of at least 2"):
+            TapOffsets(1.0, taps)

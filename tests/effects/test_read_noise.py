@@ -1,0 +1,82 @@
+"""What shapes the read noise: its rms stays sigma, its tails and its map over pixels change; telegraph noise."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from hsnoise.effects import HeavyTailedReadNoise, RandomTelegraphNoise, ReadNoise, ReadNoiseNonuniformity
+from hsnoise.model import NoiseModel, sample_dark
+
+KEY = jax.random.key(37)
+P_VALUE = 1e-5
+
+
+def darks(frames, shape, *effects):
+    model = NoiseModel(effects, cfa="mono", shutter="rolling", exposure_s=0.05)
+    return np.asarray(sample_dark(KEY, frames, shape, model))
+
+
+@pytest.mark.parametrize("dof", [2.5, 5.0, 30.0])
+def test_heavy_tails_are_students_t_of_the_same_sigma(dof):
+    drawn = darks(1, (300, 300), ReadNoise(3.0), HeavyTailedReadNoise(dof)).ravel()
+    t = drawn / 3.0 * np.sqrt(dof / (dof - 2))
+    assert stats.kstest(t, stats.t(dof).cdf).pvalue > P_VALUE
+    assert stats.kstest(drawn / 3.0, "norm").pvalue < P_VALUE or dof == 30
+    if dof > 4:
+        squares = drawn**2
+        assert abs(squares.mean() - 9) < 5 * squares.std() / np.sqrt(squares.size)
+
+
+def test_heavy_tails_are_independent_of_pixel_and_frame():
+    drawn = darks(100, (30, 30), HeavyTailedReadNoise(6.0), ReadNoise(3.0))
+    log_size = np.log(np.abs(drawn))
+    size = log_size - log_size.mean()
+    for product in (size[1:] * size[:-1], size[:, 1:] * size[:, :-1], size[:, :, 1:] * size[:, :, :-1]):
+        assert abs(product.mean()) < 5 * product.std() / np.sqrt(product.size)
+
+
+def test_many_degrees_of_freedom_are_a_gaussian():
+    plain = darks(2, (20, 20), ReadNoise(3.0))
+    np.testing.assert_allclose(darks(2, (20, 20), HeavyTailedReadNoise(1e9), ReadNoise(3.0)), plain, rtol=1e-3)
+
+
+def test_nonuniform_read_noise_is_log_normal_over_pixels_of_the_same_rms():
+    frames, spread = 2000, 0.4
+    drawn = darks(frames, (40, 40), ReadNoiseNonuniformity(spread), ReadNoise(3.0))
+    variance = np.mean(drawn**2, 0)
+    log_sigma = np.log(variance).ravel() / 2
+    # The variance of frames draws scatters by 2 / frames: that of ln sigma by 1 / (2 frames), small beside spread^2.
+    z = (log_sigma - np.log(3.0) + spread**2) / np.sqrt(spread**2 + 1 / (2 * frames))
+    assert stats.kstest(z, "norm").pvalue > P_VALUE
+    assert abs(variance.mean() - 9) < 5 * variance.std() / np.sqrt(variance.size)
+    one = drawn / np.sqrt(variance)
+    assert abs(np.mean(one**4) - 3 * frames / (frames + 2)) < 5 * np.sqrt(96 / one.size)
+
+
+def test_two_shapes_multiply():
+    drawn = darks(1, (300, 300), ReadNoiseNonuniformity(0.3), HeavyTailedReadNoise(20.0), ReadNoise(3.0)).ravel()
+    fourth = 3 * np.exp(4 * 0.3**2) * (18 / 16)
+    x = drawn / 3
+    assert abs(np.mean(x**2) - 1) < 5 * np.std(x**2) / np.sqrt(x.size)
+    assert abs(np.mean(x**4) - fourth) < 5 * np.std(x**4) / np.sqrt(x.size)
+
+
+def test_shapes_leave_the_signal_alone_without_read_noise():
+    assert np.all(darks(1, (8, 8), ReadNoiseNonuniformity(0.3), HeavyTailedReadNoise(5.0)) == 0)
+
+
+def test_telegraph_pixels_jump_between_two_levels():
+    frames, shape, fraction, duty = 200, (100, 100), 0.1, 0.3
+    drawn = darks(frames, shape, RandomTelegraphNoise(fraction, 7.0, duty))
+    assert set(np.unique(drawn)) == {0.0, 7.0}
+    jumps = drawn.max(0) > 0
+    assert abs(jumps.mean() - fraction) < 5 * np.sqrt(fraction * (1 - fraction) / jumps.size)
+    states = drawn[:, jumps] / 7.0
+    assert abs(states.mean() - duty) < 5 * np.sqrt(duty * (1 - duty) / states.size)
+    assert abs(np.mean((states[1:] - duty) * (states[:-1] - duty))) < 5 * duty * (1 - duty) / np.sqrt(states.size)
+    # Over pixels the number of high frames is binomial.
+    high = states.sum(0)
+    assert abs(high.var() / (frames * duty * (1 - duty)) - 1) < 5 * np.sqrt(2 / high.size)
