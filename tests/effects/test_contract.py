@@ -107,15 +107,6 @@ SHAPE_READ_NOISE = HeavyTailedReadNoise | ReadNoiseNonuniformity
 each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: effect.name)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compile_quickly():
-    # Hundreds of programs run once on a few pixels: their compilation is all the time there is.
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 def model_of(effect):
     effects = [effect, ReadNoise(3.5)] if isinstance(effect, SHAPE_READ_NOISE) else [effect]
     return NoiseModel(effects, cfa="RGGB", shutter="rolling", exposure_s=0.1)
