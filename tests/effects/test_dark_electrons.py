@@ -31,15 +31,15 @@ def poisson_z(drawn, mean):
 
 
 def test_hot_pixels_are_few_exponential_and_poisson():
-    drawn = darks(HotPixels(0.05, 4e4), 20, (200, 200))
+    drawn = darks(HotPixels(0.05, 4e4), 20, (80, 80))
     means = drawn.mean(0)
     hot = means > 0
-    # Hot pixels that stay at zero electrons in all frames: 1 in 20 * 2e4, none to speak of.
+    # A hot pixel without an electron in all frames: one in 4e5.
     assert abs(hot.mean() - 0.05) < 5 * np.sqrt(0.05 * 0.95 / hot.size)
     assert stats.kstest(means[hot] / 2e4, "expon").pvalue > P_VALUE
     ratio = drawn.var(0, ddof=1)[hot] / means[hot]
     assert abs(ratio.mean() - 1) < 5 * np.sqrt(2 / 19 / hot.sum())
-    longer = darks(HotPixels(0.05, 4e4), 20, (200, 200), exposure_s=1.0).mean(0)
+    longer = darks(HotPixels(0.05, 4e4), 20, (80, 80), exposure_s=1.0).mean(0)
     np.testing.assert_array_equal(longer > 0, hot)
     np.testing.assert_allclose(longer.sum() / means.sum(), 2, atol=0.01)
 
