@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -63,6 +64,16 @@ def crop(counts: Any, rows: slice, columns: slice, *, frames: slice | None = Non
 
 def _read_region(counts: Any, index: int, rows: slice, columns: slice) -> np.ndarray:
     return np.asarray(counts[index])[rows, columns]
+
+
+def read_mapped(counts: np.memmap, number: int) -> np.ndarray:
+    """A copy of one frame of a memory map, whose pages then no longer count as this process's memory."""
+    frame = np.array(counts[number])
+    mapping = getattr(counts, "_mmap", None)
+    # Only of files opened to read: a private map would lose what was written to it.
+    if mapping is not None and counts.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
+        mapping.madvise(mmap.MADV_DONTNEED)
+    return frame
 
 
 def check_values(frame: np.ndarray, *, white_level: float | None = None, name: str = "counts") -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,14 +15,15 @@ import optimistix as optx
 from hsnoise.coordinates import Coordinates
 from hsnoise.physics import Physics, Rules, evaluate
 from hsnoise.plan import plan_rules
-from hsnoise.statistics import Summary, first_frames, without_counts
+from hsnoise.statistics import Summary, every_nth_row, some_frames, without_counts
 
 ROUNDS = 16
 STEPS = 60
 CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many standard errors
-FIRST_SPREAD = 0.03  # taken for a standard error of every coordinate before one is known
-PILOT_ROWS = 30_000
-CHORDS, CHORD_MARGIN = 12, 1.06
+# Taken for a standard error of every coordinate before one is known: at most this, and this over the root of pixels.
+FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
+MANY_ROWS, PILOT_ROWS = 30_000, 3_000
+CHORDS, PIECE_MARGIN = 12, 1.1
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
 REFINEMENTS = 4  # of the curvature
 IDLE_BELOW = -3.0  # softplus coordinate: less than 5 % of what the data resolve
@@ -48,17 +49,33 @@ class Maximum(NamedTuple):
 def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     """Maximise log-likelihood plus weak prior from `coordinates.base`. Call with float64 enabled.
 
-    A capture of very many rows is fitted on a few of its frames first; their curvature, scaled up, then guides a few
-    Newton steps on all of it, each the cost of one gradient, and gives the standard errors.
+    A capture of very many rows is fitted on some rows of a few of its frames first. The curvature of those frames,
+    scaled up, then guides a few Newton steps on all, each the cost of one gradient, and gives the standard errors.
     """
-    frames = max(summary.n_frames, default=1)
-    rows = sum(h.counts[..., 0].size for h in summary.histograms)
-    few = max(1, int(frames * PILOT_ROWS / max(rows, 1)))
-    if rows < 2 * PILOT_ROWS or few >= frames:
+    if _n_rows(summary) < 2 * MANY_ROWS:
         return _by_rounds(coordinates, summary)
-    pilot = first_frames(summary, few)
-    start = _by_rounds(coordinates, pilot)
-    return _by_chords(coordinates, summary, start, sum(summary.n_frames) / sum(pilot.n_frames))
+    frames = max(1, int(max(summary.n_frames) * MANY_ROWS / _n_rows(summary)))
+    few, thinning = some_frames(summary, 0, frames), 1
+    coarsest = max(h.row_stride for h in summary.histograms)
+    while _n_rows(few) > 2 * thinning * PILOT_ROWS and summary.shape[0] % (2 * thinning * coarsest) == 0:
+        thinning *= 2
+    pilot = _by_rounds(coordinates, every_nth_row(few, thinning))
+    scale = sum(summary.n_frames) / sum(few.n_frames)
+    darks, flats = _pieces(pilot.physics, summary, frames)
+    # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.
+    guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
+    _, _, whiten = _curvature(coordinates, pilot.vector, pilot.whiten / np.sqrt(thinning), guide)
+    vector, _, _, steps = _chords(pilot.vector, whiten, guide)
+    information = _in_parameters(coordinates, vector, whiten, guide) * scale
+    whole = partial(_gradients_of_pieces, coordinates, [*darks, *flats], 1.0)
+    whiten = whiten / np.sqrt(scale)
+    vector, value, distance, more = _chords(vector, whiten, whole)
+    iterations = pilot.iterations + steps + more
+    return _ended(coordinates, vector, whiten, information, value, iterations, distance)
+
+
+def _n_rows(summary: Summary) -> int:
+    return sum(h.counts[..., 0].size for h in summary.histograms)
 
 
 def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
@@ -66,8 +83,9 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
     light = without_counts(summary)
     vector = eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base)
     rules = plan_rules(coordinates.base, summary)
-    whiten = FIRST_SPREAD * np.eye(len(vector))
-    value, gradient, whiten = _curvature(coordinates, vector, whiten, light, rules)
+    pixels = sum(h.counts.sum(dtype=np.float64) for h in summary.histograms) + 1.0
+    whiten = min(FIRST_SPREAD, FIRST_SPREAD_OF_ONE / np.sqrt(pixels)) * np.eye(len(vector))
+    value, gradient, whiten = _curvature(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
     iterations, distance = 0, np.inf
     for _ in range(ROUNDS):
         ahead, steps = quasi_newton(coordinates, vector, whiten, coordinates.reach(vector), value, light, rules)
@@ -76,7 +94,7 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
             distance = np.inf
             break
         rules = replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary))
-        value, gradient, whiten = _curvature(coordinates, ahead, whiten, light, rules)
+        value, gradient, whiten = _curvature(coordinates, ahead, whiten, partial(_gradients, coordinates, light, rules))
         # Length in standard errors of the Newton step that is left.
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
         if not np.isfinite(distance):
@@ -84,25 +102,58 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
         vector = ahead
         if distance < CLOSE_SIGMA:
             break
-    information = _in_parameters(coordinates, vector, whiten, light, rules)
+    information = _in_parameters(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
     return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
 
 
-def _by_chords(coordinates: Coordinates, summary: Summary, start: Maximum, scale: float) -> Maximum:
-    """Newton steps on all frames with the curvature of a pilot fit times `scale`."""
-    light = without_counts(summary)
-    vector, whiten = start.vector, start.whiten / np.sqrt(scale)
-    rules = plan_rules(start.physics, summary, CHORD_MARGIN)
-    best, steps = np.inf, 0
+def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
+    """The likelihood in pieces that add up, those of darks and of flats: (summary, rules) for each.
+
+    A piece of the darks is `frames` frames of one channel, all of one shape, so that memory and compilation are
+    those of one piece; the channels of the first frames come first.
+    """
+    channels = range(len(summary.channels))
+    light = without_counts(replace(summary, flats=None))
+    parts = (some_frames(summary, start, start + frames) for start in range(0, max(summary.n_frames), frames))
+    rules = [[plan_rules(physics, part, PIECE_MARGIN, channel=c) for c in channels] for part in parts]
+    most = [reduce(lambda one, other: replan(other, one), [of[c] for of in rules]) for c in channels]
+    darks = [(light, replan(most[c], of[c])) for of in rules for c in channels]
+    return darks, [] if summary.flats is None else [(replace(summary, histograms=()), ())]
+
+
+def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, points):
+    """Values and gradients at `points`, summed over the pieces."""
+    values, gradients = [], []
+    for point in jnp.asarray(points):
+        value, gradient = (np.asarray(x) for x in _prior_at(coordinates, point))
+        prior, slope = value, gradient
+        for light, rules in pieces:
+            weight = 1.0 if light.histograms else flats_weight
+            of_piece, gradient_of_piece = gradient_at(coordinates, point, light, rules)
+            value = value + weight * (np.asarray(of_piece) - prior)  # each piece has the prior in it
+            gradient = gradient + weight * (np.asarray(gradient_of_piece) - slope)
+        values.append(value)
+        gradients.append(gradient)
+    return np.asarray(values), np.asarray(gradients)
+
+
+def _chords(vector, whiten, gradients):
+    """Newton steps with the curvature that `whiten` tells: (vector, value, standard errors left, steps)."""
+    best, steps = (vector, -np.inf, np.inf), 0
     while True:
-        value, gradient = (np.asarray(x) for x in gradient_at(coordinates, jnp.asarray(vector), light, rules))
+        (value,), (gradient,) = gradients(vector[None])
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
-        if distance < CLOSE_SIGMA or distance > 2 * best or steps == CHORDS:
-            break
-        best, steps = min(best, distance), steps + 1
+        ahead = distance < best[2]
+        best = (vector, float(value), distance) if ahead else best
+        if distance < CLOSE_SIGMA or not ahead or steps == CHORDS:
+            return *best, steps
+        steps += 1
         vector = vector + whiten @ (whiten.T @ gradient)
-    information = start.information * scale
-    return _ended(coordinates, vector, whiten, information, float(value), start.iterations + steps, distance)
+
+
+@eqx.filter_jit
+def _prior_at(coordinates, vector):
+    return jax.value_and_grad(coordinates.log_prior)(vector)
 
 
 def _objective(coordinates: Coordinates, vector, summary: Summary, rules: Rules):
@@ -132,7 +183,7 @@ def gradient_at(coordinates, vector, summary, rules):
 
 
 @eqx.filter_jit
-def _gradients(coordinates, points, summary, rules):
+def _gradients(coordinates, summary, rules, points):
     return jax.lax.map(jax.value_and_grad(partial(_at, coordinates, summary, rules)), points)
 
 
@@ -146,7 +197,7 @@ def _parameters(coordinates, vector):
     return physics, coordinates.flat(physics), coordinates.slope(vector), coordinates.log_prior(vector)
 
 
-def _curvature(coordinates, vector, whiten, summary, rules):
+def _curvature(coordinates, vector, whiten, gradients_at):
     """Value, gradient and whitening W at `vector`, W W' the inverse of minus the Hessian.
 
     The Hessian comes from differences of exact gradients along the columns of an earlier W: there all directions curve
@@ -161,7 +212,7 @@ def _curvature(coordinates, vector, whiten, summary, rules):
         steps = DIFFERENCE_SIGMA / np.maximum(np.abs(inner).max(0), 1.0)
         points = np.repeat(np.asarray(vector)[None], len(vector) + 1, axis=0)
         points[1 : 1 + active.sum(), active] += (inner * steps).T
-        values, gradients = (np.asarray(x) for x in _gradients(coordinates, jnp.asarray(points), summary, rules))
+        values, gradients = (np.asarray(x) for x in gradients_at(points))
         change = (gradients[1 : 1 + active.sum()] - gradients[0])[:, active]
         hessian = change / steps[:, None] @ inner
         if not np.isfinite(hessian).all():
@@ -200,7 +251,7 @@ def replan(old: Rules, new: Rules) -> Rules:
     return tuple(enough(o, n) for o, n in zip(old, new, strict=True))
 
 
-def _in_parameters(coordinates, vector, whiten, summary, rules) -> np.ndarray:
+def _in_parameters(coordinates, vector, whiten, gradients_at) -> np.ndarray:
     """Information on the parameters themselves, from the whitening of the coordinates.
 
     A parameter at its bound of zero (no dark current, no row gain) has a coordinate far out where nothing changes; its
@@ -216,7 +267,7 @@ def _in_parameters(coordinates, vector, whiten, summary, rules) -> np.ndarray:
     for i in at_bound:
         ends = points.copy()
         ends[:2, i] = (0.0, 1.5)
-        _, gradients = _gradients(coordinates, jnp.asarray(ends), summary, rules)
+        _, gradients = gradients_at(ends)
         at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends[:2])
         values, slopes = zip(*(map(np.asarray, at_end[1:3]) for at_end in at_ends), strict=True)
         low, high = (np.asarray(g) / s for g, s in zip(gradients[:2], slopes, strict=True))

@@ -21,24 +21,31 @@ MARGIN = 1.35  # in beta on either side, so that the parameters may move during 
 EXTREME_ROWS = 6
 NODES_PER_SIGMA = 1.0  # of the sharpest row; the trapezoid's error is exp(-2 pi^2) (Poisson summation)
 MOST_NODES = 1024
-GROUP_ROWS, MOST_GROUPS = 192, 48
+GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
 
 
-def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN) -> Rules:
-    """Quadrature rules for the rows at `physics` (at the moment estimates while `physics` is traced)."""
+def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN, channel: int | None = None) -> Rules:
+    """Quadrature rules for the rows at `physics` (at the moment estimates while `physics` is traced).
+
+    margin: in beta, on either side of where the rows are now. channel: of that channel only.
+    """
     if not summary.histograms:
         return ()
     if any(map(is_traced, jax.tree.leaves(physics))):
         physics = start_physics(summary, with_row_gain=physics.row_sigma is not None)
-    strides = sorted({h.row_stride for h in summary.histograms})
+    channels = range(len(summary.histograms)) if channel is None else [channel]
+    alike = [
+        [c for c in channels if summary.histograms[c].row_stride == stride]
+        for stride in sorted({summary.histograms[c].row_stride for c in channels})
+    ]
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
         physics = jax.tree.map(lambda x: np.asarray(x, np.float64), physics)
-        return tuple(_rule(physics, stride, summary, margin) for stride in strides)
+        return tuple(_rule(physics, chosen, summary, margin) for chosen in alike)
 
 
-def _rule(physics: Physics, stride: int, summary: Summary, margin: float) -> RowRule:
-    """The rule of all channels that use every `stride`-th sensor row."""
-    chosen = [c for c, h in enumerate(summary.histograms) if h.row_stride == stride]
+def _rule(physics: Physics, chosen: list[int], summary: Summary, margin: float) -> RowRule:
+    """The rule of the channels `chosen`, which use the same share of the sensor rows."""
+    stride = summary.histograms[chosen[0]].row_stride
     exposures = len(summary.exposure_s)
     channel, exposure = np.repeat(chosen, exposures), np.tile(np.arange(exposures), len(chosen))
     if physics.row_sigma is None:
@@ -75,7 +82,7 @@ def _channel_blocks(physics: Physics, c: int, summary: Summary, margin: float):
     span = np.arcsinh(high / scale[:, None]) - np.arcsinh(low / scale[:, None])
     wanted = (NODES_PER_SIGMA * span / width).max(0) + 16
     # The group of the darkest rows reaches far down and needs many nodes, the others few.
-    cuts = [slice(0, 1), slice(1, None)] if len(wanted) == MOST_GROUPS else [slice(None)]
+    cuts = [slice(0, 1), slice(1, None)] if len(wanted) > SPLIT_FROM else [slice(None)]
     blocks = [
         Block(counts[:, cut], low[:, cut], high[:, cut], min(round_up(int(wanted[cut].max())), MOST_NODES))
         for cut in cuts

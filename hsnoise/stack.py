@@ -21,7 +21,7 @@ from hsnoise._arguments import (
     span,
     temperatures,
 )
-from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, shift_cfa, transpose_cfa
+from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
 from hsnoise._types import BAYER_CFAS, SHUTTERS, channels_of
 
 
@@ -140,7 +140,8 @@ class FrameStack:
         Contiguous uint16, or int32 where the stored type is signed, floating or wider than 16 bits. A lazy
         frame is read now, and checked: see `check_frame`.
         """
-        frame = np.asarray(self.counts[exposure][number])
+        counts = self.counts[exposure]
+        frame = read_mapped(counts, number) if isinstance(counts, np.memmap) else np.asarray(counts[number])
         if self.is_lazy(exposure):
             check_frame(frame, self, exposure=exposure, frame_number=number)
         dtype = np.uint16 if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2 else np.int32

@@ -105,15 +105,29 @@ def row_stride(cfa: str, channel: str) -> int:
     return 1 if cfa == "mono" or len(channel_planes(cfa, channel)) == 2 else 2
 
 
-def first_frames(summary: Summary, frames: int) -> Summary:
-    """The summary of the first `frames` frames of each dark exposure (and of all flats)."""
+def some_frames(summary: Summary, start: int, stop: int) -> Summary:
+    """The summary of frames start to stop of each dark exposure (and of all flats); empty frames fill it up."""
 
     def cut(h: RowHistograms) -> RowHistograms:
-        parts = {name: getattr(h, name)[:, :frames] for name in ("counts", "row_sum", "row_sum_of_squares")}
-        return replace(h, **parts)
+        def part(x):
+            chosen = x[:, start:stop]
+            missing = stop - start - chosen.shape[1]
+            return np.pad(chosen, [(0, 0), (0, missing)] + [(0, 0)] * (x.ndim - 2)) if missing else chosen
 
-    n_frames = tuple(min(n, frames) for n in summary.n_frames)
+        return replace(h, **{name: part(getattr(h, name)) for name in ("counts", "row_sum", "row_sum_of_squares")})
+
+    n_frames = tuple(int(np.clip(n - start, 0, stop - start)) for n in summary.n_frames)
     return replace(summary, histograms=tuple(map(cut, summary.histograms)), n_frames=n_frames)
+
+
+def every_nth_row(summary: Summary, n: int) -> Summary:
+    """The summary of every n-th row of each colour: a coloured row gain keeps its law, with the spectrum folded."""
+
+    def thin(h: RowHistograms) -> RowHistograms:
+        parts = {name: getattr(h, name)[:, :, ::n] for name in ("counts", "row_sum", "row_sum_of_squares")}
+        return replace(h, **parts, row_stride=h.row_stride * n)
+
+    return replace(summary, histograms=tuple(map(thin, summary.histograms)))
 
 
 def without_counts(summary: Summary) -> Summary:

@@ -220,15 +220,34 @@ def test_line_method_and_likelihood_agree(canon_fit):
         assert abs(difference) < 5 * np.hypot(line.table[name][1], result.table[name][1])
 
 
-def test_pilot_of_a_large_capture_ends_where_the_whole_does(monkeypatch, canon_fit):
-    _, whole = canon_fit
-    monkeypatch.setattr(maximise_module, "PILOT_ROWS", 2600)  # half the frames
+def assert_pilot_ends_where(whole, monkeypatch):
+    monkeypatch.setattr(maximise_module, "MANY_ROWS", 1500)  # two of the four frames
+    monkeypatch.setattr(maximise_module, "PILOT_ROWS", 400)  # every second row of them
     piloted = hsnoise.fit(whole.summary)
     assert piloted.outcome.startswith("converged")
     for name in whole.names:
         value, error, _ = whole.table[name]
         assert abs(piloted.table[name][0] - value) < 0.1 * error
         assert 0.7 < piloted.table[name][1] / error < 1.4
+
+
+def test_pilot_of_a_large_capture_ends_where_the_whole_does(monkeypatch, canon_fit):
+    assert_pilot_ends_where(canon_fit[1], monkeypatch)
+
+
+@pytest.mark.slow
+def test_pilot_of_a_large_capture_with_flats_ends_where_the_whole_does(monkeypatch):
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    darks = capture(model)
+    lights = [
+        np.asarray(hsnoise.sample(jax.random.key(i), np.full((2, *SHAPE), x), model))
+        for i, x in enumerate((200.0, 800.0))
+    ]
+    flats = hsnoise.FrameStack(lights, (0.01, 0.04), black_level=64, cfa="RGGB", shutter="global", kind="flat")
+    stack = hsnoise.FrameStack.join(
+        hsnoise.FrameStack(darks.counts, EXPOSURE_S, black_level=64, cfa="RGGB", shutter="global"), flats
+    )
+    assert_pilot_ends_where(hsnoise.fit(stack), monkeypatch)
 
 
 @pytest.mark.parametrize(

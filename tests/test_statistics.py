@@ -14,7 +14,16 @@ from hypothesis.extra.numpy import arrays
 from hsnoise._frames import LazyFrames
 from hsnoise._types import BAYER_CFAS
 from hsnoise.stack import FrameStack
-from hsnoise.statistics import MOST_BINS, channel_rows, first_frames, round_up, row_stride, summarise, without_counts
+from hsnoise.statistics import (
+    MOST_BINS,
+    channel_rows,
+    every_nth_row,
+    round_up,
+    row_stride,
+    some_frames,
+    summarise,
+    without_counts,
+)
 
 CFAS = ("mono", *BAYER_CFAS)
 BLACK_DN, GAIN, READ_E = 64.0, 1.3, 4.0
@@ -191,12 +200,12 @@ def test_sizes_are_rounded_up_by_less_than_half(size):
     assert rounded in {2**k for k in range(4, 9)} | {3 * 2**k for k in range(3, 8)}
 
 
-def test_first_frames_are_those_of_each_exposure(rng):
+def test_some_frames_are_those_of_each_exposure(rng):
     counts = [dark_counts(rng, n, (8, 12)) for n in (4, 1, 2)]
     flat = dark_counts(rng, 3, (8, 12), mean=300)
     keywords = {"exposure_s": [0.1, 0.2, 0.3, 0.1], "kind": ("dark",) * 3 + ("flat",), "cfa": "RGGB"}
     summary = summarise(FrameStack([*counts, flat], **keywords))
-    few = first_frames(summary, 2)
+    few = some_frames(summary, 0, 2)
     assert few.n_frames == (2, 1, 2)
     assert few.flats is summary.flats
     for cut, h in zip(few.histograms, summary.histograms, strict=True):
@@ -207,7 +216,20 @@ def test_first_frames_are_those_of_each_exposure(rng):
                 np.testing.assert_array_equal(cut.counts[e, f], [count_one_by_one(r, h.edges_dn[e]) for r in rows])
                 np.testing.assert_array_equal(cut.row_sum[e, f], [r.sum() for r in rows])
         assert cut.outlier_law is h.outlier_law and cut.edges_dn is h.edges_dn
-    jax.tree.map(np.testing.assert_array_equal, first_frames(summary, 9), summary)
+    jax.tree.map(np.testing.assert_array_equal, some_frames(summary, 0, 4), summary)
+    late = some_frames(summary, 3, 5)  # one frame of the first exposure is left, and one of padding
+    assert late.n_frames == (1, 0, 0)
+    for cut, h in zip(late.histograms, summary.histograms, strict=True):
+        np.testing.assert_array_equal(cut.counts[:, 0], h.counts[:, 3])
+        assert cut.counts.shape[1] == 2 and not cut.counts[:, 1].any()
+
+
+def test_every_nth_row_thins_the_rows_of_each_colour(rng):
+    summary = summarise(FrameStack(dark_counts(rng, 2, (16, 12)), 0.1, cfa="RGGB"))
+    thin = every_nth_row(summary, 4)
+    for cut, h in zip(thin.histograms, summary.histograms, strict=True):
+        np.testing.assert_array_equal(cut.counts, h.counts[:, :, ::4])
+        assert cut.row_stride == 4 * h.row_stride
 
 
 def test_without_counts_all_else_remains(rng):
