@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ def parser() -> argparse.ArgumentParser:
         description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
         "the same noise. New here? Run: hsnoise demo",
     )
+    top.add_argument("--version", action="version", version=f"hsnoise {version('hsnoise')}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _demo_arguments(commands)
     _fit_arguments(commands)
@@ -91,9 +93,7 @@ def _sample_arguments(commands: Any) -> None:
     sample.add_argument(
         "--exposure", type=_numbers, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
     )
-    sample.add_argument(
-        "--shape", type=_shape, default=(480, 640), metavar="ROWSxCOLUMNS", help="of dark frames (480x640)"
-    )
+    sample.add_argument("--shape", type=_shape, metavar="ROWSxCOLUMNS", help="of dark frames (default 480x640)")
     sample.add_argument(
         "--clean",
         metavar="IMAGE",

@@ -26,7 +26,19 @@ from hsnoise.model import NoiseModel
 from hsnoise.photometry import scale_to_photoelectrons
 from hsnoise.stack import FrameStack
 
+SAMPLE_SHAPE = (480, 640)
 DEMO_EXPOSURES_S, DEMO_FRAMES, DEMO_SHAPE, DEMO_SEED = (0.05, 0.1, 0.2, 0.4), 8, (160, 240), 0
+
+OPTIONS = {
+    "exposure_s": "--exposure",
+    "black_level": "--black-level",
+    "white_level": "--white-level",
+    "cfa": "--cfa",
+    "roi": "--roi",
+    "shutter": "--shutter",
+    "kind": "--kind",
+    "flats": "--flats",
+}
 
 MEANING = """\
 One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
@@ -58,7 +70,10 @@ def main(argv: list[str] | None = None) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(str(error).split())
+    text = " ".join(str(error).split())
+    # Users of the command line know its options, not the arguments of the library.
+    argument, colon, rest = text.partition(":")
+    return f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
 
 
 # Commands
@@ -117,9 +132,17 @@ def _sample(args: argparse.Namespace) -> None:
         raise ValueError(f"--out: there is no folder {args.out.parent}")
     if args.mean_e is not None and args.clean is None:
         raise ValueError("--mean-e: goes with --clean, the image that it scales")
+    if args.mean_e is not None and not args.mean_e > 0:
+        raise ValueError(f"--mean-e: expected photoelectrons above 0, got {args.mean_e:g}")
+    if args.shape is not None and args.clean is not None:
+        raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
     model = _model(args.model)
     exposures_s = args.exposure or [model.exposure_s]
-    clean = np.zeros(args.shape, np.float32) if args.clean is None else _clean(args.clean, args.mean_e, model)
+    clean = (
+        np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
+        if args.clean is None
+        else _clean(args.clean, args.mean_e, model)
+    )
     counts = _draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = _metadata(model, exposures_s, "flat" if args.clean else "dark")
     write_atomically(args.out, frames_file(suffix, counts, metadata))

@@ -284,7 +284,9 @@ def _in_parameters(coordinates, vector, whiten, gradients_at) -> np.ndarray:
 
 def _is_positive(matrix: np.ndarray, places: list[int]) -> bool:
     part = matrix[np.ix_(places, places)]
-    scale = np.sqrt(np.maximum(np.diagonal(part), 1e-300))
+    scale = np.sqrt(np.maximum(np.diagonal(part), 0.0))
+    if not scale.all():
+        return False
     return bool(np.linalg.eigvalsh(part / scale[:, None] / scale[None, :]).min() > 1e-9)
 
 

@@ -178,6 +178,8 @@ def test_darks_flats_and_options_reach_the_stack(tmp_path):
         (["sample", "canon_5d3", "--out", "x.npz", "--shape", "15x15"], "even"),
         (["sample", "canon_5d3", "--out", "x.npz", "--mean-e", "3"], "--clean"),
         (["sample", "canon_5d3", "--out", "x.npz", "--clean", "text.txt"], "text.txt"),
+        (["sample", "canon_5d3", "--out", "x.npz", "--clean", "text.txt", "--mean-e", "0"], "--mean-e"),
+        (["sample", "canon_5d3", "--out", "x.npz", "--clean", "text.txt", "--shape", "8x8"], "--shape"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
