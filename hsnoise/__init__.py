@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from hsnoise import cameras
+from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
 from hsnoise.fit import FitResult, fit
 from hsnoise.io import load
@@ -24,7 +25,10 @@ __all__ = [
     "NoiseModel",
     "Stage",
     "cameras",
+    "compare",
+    "diagnose",
     "fit",
+    "improve",
     "load",
     "log_likelihood",
     "param",

@@ -19,10 +19,12 @@ from hsnoise.profile import profile_errors
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, summarise
+from hsnoise.synthetic import fit_synthetic
 
 OUTLIERS_FROM = 1e-4
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
+BASE_NAMES = tuple(effect.name for effect in BASE_EFFECTS)
 
 
 def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progress=None, **keywords) -> FitResult:
@@ -32,7 +34,8 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         stack: FrameStack, a `Summary` of one, or an array [frame, row, column] or [exposure, frame, row, column]
             with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...).
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
-            not used. Default: all of the paper's.
+            not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
+            together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "auto" is
             "ml", and if that does not converge, "line", which the result then says.
         progress: called with no argument after each frame that has been read.
@@ -49,6 +52,9 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    extra = () if model is None else tuple(name for name in model.names if name not in BASE_NAMES)
+    if extra:
+        return _with_effects(stack, model, extra, method, progress, keywords)
     with_row_gain = model is None or _check_model(model)
     summary = stack if isinstance(stack, Summary) else _summary_of(as_stack(stack, **keywords), progress)
     if model is not None and (model.cfa, model.shutter) != (summary.cfa, summary.shutter):
@@ -78,6 +84,18 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         if method == "ml":
             raise RuntimeError(f"fit: maximum likelihood did not converge: {result.outcome}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({result.outcome}); the line fit instead")
+
+
+def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, progress, keywords) -> FitResult:
+    """A fit of the base effects by likelihood, then of all together by simulated statistics."""
+    if isinstance(stack, Summary):
+        raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
+    stack = as_stack(stack, **keywords)
+    bare = model
+    for name in extra:
+        bare = bare.remove(name)
+    base = fit(stack, model=bare, method=method, progress=progress)
+    return fit_synthetic(base, stack, model)
 
 
 def _summary_of(stack, progress) -> Summary:

@@ -16,6 +16,12 @@ from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, binning, dark_laws, log_probability
 from hsnoise.statistics import Summary, without_counts
 
+TITLES = {
+    "ml": "Joint maximum likelihood",
+    "line": "Line fit",
+    "synthetic": "Maximum likelihood, corrected for added effects by simulated statistics",
+}
+
 
 @dataclass(frozen=True)
 class FitResult:
@@ -24,7 +30,7 @@ class FitResult:
     Attributes:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         names, covariance: fitted parameters and their covariance, in the units of `table`.
-        method: "ml" or "line".
+        method: "ml", "line", or "synthetic" with effects beyond the paper's.
         outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
@@ -74,7 +80,7 @@ class FitResult:
     def __str__(self) -> str:
         darks = f"{sum(self.summary.n_frames)} dark frames at {len(self.summary.exposure_s)} exposures"
         flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
-        title = {"ml": "Joint maximum likelihood", "line": "Line fit"}[self.method]
+        title = TITLES[self.method]
         table = Table()
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")

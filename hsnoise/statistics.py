@@ -136,10 +136,18 @@ def without_counts(summary: Summary) -> Summary:
     return replace(summary, histograms=tuple(replace(h, **empty) for h in summary.histograms))
 
 
-def summarise(stack: FrameStack, progress=None) -> Summary:
+Coding = list[dict[str, tuple[int, int, int]]]
+
+
+def coding_of(stack: FrameStack) -> Coding:
+    """The bins that `summarise` chooses for the darks of a stack: for each exposure, `_coding` of each channel."""
+    return [_codings(stack, i) for i, kind in enumerate(stack.kind) if kind == "dark"]
+
+
+def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) -> Summary:
     """One pass over the pixels of `stack`: its row histograms (darks) and photon transfer (flats).
 
-    progress: called with no argument after each frame. Raises ValueError for frames that cannot be measured
+    progress: called with no argument after each frame. coding: bins of another stack, to compare with it. Raises ValueError for frames that cannot be measured
     (NaN, constant, all zero, saturated) and where nothing is left to fit.
     """
     tick = progress or (lambda: None)
@@ -147,7 +155,7 @@ def summarise(stack: FrameStack, progress=None) -> Summary:
     flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
     return Summary(
         exposure_s=np.asarray([stack.exposure_s[i] for i in darks], np.float64),
-        histograms=_row_histograms(stack, darks, tick) if darks else (),
+        histograms=_row_histograms(stack, darks, tick, coding or coding_of(stack)) if darks else (),
         flats=_flat_moments(stack, flats, tick) if flats else None,
         black_level_dn=_black_per_channel(stack),
         white_level_dn=stack.white_level,
@@ -164,9 +172,8 @@ def _black_per_channel(stack: FrameStack) -> np.ndarray | None:
     return np.broadcast_to(np.asarray(stack.black_level, np.float64), (len(stack.channels),)).copy()
 
 
-def _row_histograms(stack: FrameStack, groups: list[int], tick) -> tuple[RowHistograms, ...]:
+def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) -> tuple[RowHistograms, ...]:
     channels, frames = stack.channels, max(stack.n_frames[i] for i in groups)
-    coding = [_codings(stack, i) for i in groups]
     # One number of bins for all channels and exposures: they share compiled programs.
     bins = round_up(2 + max(n for of in coding for _, _, n in of.values()))
     rows = {c: stack.shape[0] // row_stride(stack.cfa, c) for c in channels}

@@ -24,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammaincc
 
 from hsnoise._keys import named_key
 from hsnoise._types import (
@@ -40,6 +41,9 @@ from hsnoise._types import (
 )
 
 LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
+
+
+POISSON_TABLE, POISSON_TABLE_UP_TO = 192, 80.0  # the table ends 12 standard deviations above the largest mean
 
 
 class Stage(enum.IntEnum):
@@ -233,6 +237,23 @@ def draw_poisson(key: RandomKey, mean: Frames) -> Frames:
     Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
     """
     return jax.random.poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)
+
+
+def draw_poisson_of_one_mean(key: RandomKey, mean: Scalar, like: Frames) -> Frames:
+    """Poisson counts of one mean for all pixels of `like`: from a table, many times faster than `draw_poisson`."""
+    mean = jax.lax.stop_gradient(mean)
+
+    def from_table(key):
+        k = jnp.arange(POISSON_TABLE, dtype=mean.dtype)
+        uniform = jax.random.uniform(key, like.shape, mean.dtype)
+        return jnp.searchsorted(gammaincc(k + 1, mean), uniform, side="right", method="scan_unrolled").astype(
+            like.dtype
+        )
+
+    def directly(key):
+        return jax.random.poisson(key, mean, like.shape).astype(like.dtype)
+
+    return jax.lax.cond(mean < POISSON_TABLE_UP_TO, from_table, directly, key)
 
 
 def coloured_normal(key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype) -> jax.Array:

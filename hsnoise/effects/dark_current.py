@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson_of_one_mean, param
 
 
 class DarkCurrent(AbstractEffect):
@@ -21,4 +19,4 @@ class DarkCurrent(AbstractEffect):
     rate: Scalar = param("e-/s", low=0, doc="dark electrons of a pixel in a second")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return signal + draw_poisson(key, jnp.full_like(signal, self.rate * capture.exposure_s))
+        return signal + draw_poisson_of_one_mean(key, self.rate * capture.exposure_s, signal)

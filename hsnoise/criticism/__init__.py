@@ -1,0 +1,9 @@
+"""Does the model describe the sensor, and if not, which effect is missing: compare, diagnose, improve."""
+
+from __future__ import annotations
+
+from hsnoise.criticism.compare import Comparison, compare
+from hsnoise.criticism.diagnose import Candidate, Diagnosis, diagnose
+from hsnoise.criticism.improve import Step, Story, improve
+
+__all__ = ["Candidate", "Comparison", "Diagnosis", "Step", "Story", "compare", "diagnose", "improve"]

@@ -1,0 +1,139 @@
+"""What may be missing: built-in effects at amplitudes that a dark capture may show, their details drawn at random.
+
+An amplitude of 1 is a modest effect; details that a user cannot know (period, corner, number of taps) vary from draw
+to draw, so that an effect is recognised whatever they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from hsnoise import effects as fx
+from hsnoise.effects import AbstractEffect
+from hsnoise.model import NoiseModel
+from hsnoise.stack import FrameStack
+
+Maker = Callable[[float, np.random.Generator], AbstractEffect]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What amplitudes are measured by: read noise e-, longest exposure s, dark current e-/s, gain DN/e-, frames."""
+
+    read_noise: float
+    longest_s: float
+    rate: float
+    gain: np.ndarray
+    frames: int
+    has_exposure: bool
+
+    @staticmethod
+    def of(model: NoiseModel, darks: FrameStack) -> Scale:
+        longest = float(max(darks.exposure_s))
+        return Scale(
+            read_noise=float(model["read_noise"].sigma),
+            longest_s=max(longest, 1e-9),
+            rate=float(model["dark_current"].rate) if "dark_current" in model else 0.0,
+            gain=np.asarray(model["gain"].value, float),
+            frames=max(darks.n_frames),
+            has_exposure=longest > 0,
+        )
+
+
+def built_in(model: NoiseModel, darks: FrameStack) -> dict[str, Maker]:
+    """Effects that darks can show and that the model does not have: name to a maker from amplitude and generator."""
+    scale = Scale.of(model, darks)
+    makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, darks.shutter)}
+    if scale.has_exposure:
+        makers |= _dark_signal(scale)
+    if scale.frames < 2:
+        makers = {n: m for n, m in makers.items() if n not in ("image_lag", "dark_current_drift", "frame_offset")}
+    return {name: maker for name, maker in makers.items() if name not in model}
+
+
+def given(effect: AbstractEffect) -> Maker:
+    """A user's effect: amplitude scales the parameters that may be zero, the others stay."""
+
+    def make(amplitude: float, rng: np.random.Generator) -> AbstractEffect:
+        changes = {
+            name: np.minimum(np.asarray(getattr(effect, name)) * amplitude, np.inf if spec.high is None else spec.high)
+            for name, spec in effect.specs().items()
+            if spec.low == 0
+        }
+        values = {name: getattr(effect, name) for name in effect.specs()} | changes
+        return type(effect)(**values, **effect.settings())
+
+    return make
+
+
+def _read_out(s: Scale) -> dict[str, Maker]:
+    read = s.read_noise
+    return {
+        "row_noise": lambda f, rng: fx.RowNoise(0.25 * f * read, rng.choice([0.0, 1.0])),
+        "column_noise": lambda f, rng: fx.ColumnNoise(0.25 * f * read, rng.choice([0.0, 1.0])),
+        "row_fixed_pattern": lambda f, rng: fx.RowFixedPattern(0.2 * f * read),
+        "column_fixed_pattern": lambda f, rng: fx.ColumnFixedPattern(0.2 * f * read),
+        "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read),
+        "periodic_banding": lambda f, rng: fx.PeriodicBanding(
+            0.3 * f * read, rng.uniform(0.03, 0.45), axis=str(rng.choice(["row", "column"]))
+        ),
+        "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
+        "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * rng.choice([-1, 1]), 0.0),
+        "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, taps=int(rng.choice([2, 4, 8]))),
+        "missing_codes": lambda f, rng: fx.MissingCodes(1.0 + min(f, 1.0) * rng.uniform(0.1, 1.5)),
+    }
+
+
+def _pixels(s: Scale, shutter: str) -> dict[str, Maker]:
+    read = s.read_noise
+    exponents = [0.0] if shutter == "global" else [0.0, 1.0]
+    return {
+        "shared_row_gain": lambda f, rng: fx.SharedRowGain(0.1 * f, rng.choice(exponents)),
+        "dark_signal_nonuniformity": lambda f, rng: fx.DarkSignalNonuniformity(0.35 * f * read),
+        "random_telegraph_noise": lambda f, rng: fx.RandomTelegraphNoise(
+            0.02 * f, rng.uniform(2.5, 6.0) * read, rng.uniform(0.15, 0.85)
+        ),
+        "heavy_tailed_read_noise": lambda f, rng: fx.HeavyTailedReadNoise(2.05 + 4.0 / f),
+        "read_noise_nonuniformity": lambda f, rng: fx.ReadNoiseNonuniformity(0.3 * f),
+        "crosstalk": lambda f, rng: fx.Crosstalk(min(0.015 * f, 0.2)),
+    }
+
+
+def _dark_signal(s: Scale) -> dict[str, Maker]:
+    def spot(f: float, rng: np.random.Generator) -> AbstractEffect:
+        row, column = rng.choice([0.0, 0.5, 1.0]), rng.choice([0.0, 1.0])
+        peak = 0.8 * f * max(s.read_noise, np.sqrt(s.rate * s.longest_s))
+        return fx.AmplifierGlow(peak / s.longest_s, rng.uniform(0.15, 0.5), row, column)
+
+    def hot(f: float, rng: np.random.Generator) -> AbstractEffect:
+        return fx.HotPixels(min(0.003 * f, 0.2), rng.uniform(5, 40) * s.read_noise / s.longest_s)
+
+    def cosmic(f: float, rng: np.random.Generator) -> AbstractEffect:
+        return fx.CosmicRays(40.0 * f / s.longest_s, rng.uniform(15, 80) * s.read_noise)
+
+    makers: dict[str, Maker] = {
+        "amplifier_glow": spot,
+        "hot_pixels": hot,
+        "cosmic_rays": cosmic,
+        "dark_current_drift": lambda f, rng: fx.DarkCurrentDrift(0.5 * f * s.read_noise / (s.longest_s * s.frames)),
+    }
+    if s.rate * s.longest_s > 0.2:
+        level = s.gain * s.rate
+        electrons = s.rate * s.longest_s + 2 * s.read_noise
+        makers["black_clamp"] = lambda f, rng: fx.BlackClamp(level * min(0.7 * f, 1.0))
+        makers["nonlinearity"] = lambda f, rng: fx.Nonlinearity(0.08 * f / electrons)
+        makers["image_lag"] = lambda f, rng: fx.ImageLag(min(0.03 * f, 0.5))
+    return makers
+
+
+def seeded(maker: Maker, seed: int) -> Callable[[float], AbstractEffect]:
+    """The maker with its details fixed by a seed."""
+    return partial(_with_seed, maker, seed)
+
+
+def _with_seed(maker: Maker, seed: int, amplitude: float) -> AbstractEffect:
+    return maker(amplitude, np.random.default_rng(seed))

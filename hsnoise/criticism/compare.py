@@ -1,0 +1,119 @@
+"""`compare`: where a model fails to describe a capture, and by how much."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise.criticism.reference import misfits, reference
+from hsnoise.draws import black_level_of, check_fits, darks_of
+from hsnoise.likelihood import log_likelihood
+from hsnoise.model import NoiseModel
+from hsnoise.stack import as_stack
+from hsnoise.structure import structure
+
+DRAWS = 40
+WORST = 5  # statistics told in words
+NOTABLE_Z = 4.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What `compare` found.
+
+    Attributes:
+        error: misfit of the worst group over the median that the worst group takes on the model's own draws;
+            1.0: as close to the measurement as the model's own samples are.
+        groups: misfit (chi-square per degree of freedom) of each group of statistics.
+        table: a row for each statistic: name, group, measured, model (mean of its draws), z.
+        worst: the statistics that fail most, in words.
+        p_value: how often the model's own draws are as far off (at least 1 / (draws + 1)).
+        log_likelihood_per_pixel: of the capture under the model, nats; NaN for a model with effects that state no
+            likelihood. It is held out if the model was fitted to other frames.
+        skipped: statistics that this capture does not allow, and why.
+    """
+
+    error: float
+    groups: dict[str, float]
+    table: tuple[tuple[str, str, float, float, float], ...]
+    worst: tuple[str, ...]
+    p_value: float
+    log_likelihood_per_pixel: float
+    skipped: tuple[str, ...]
+
+    def plot(self):
+        """A figure of where the model fails: `hsnoise.plots.comparison`."""
+        from hsnoise import plots  # matplotlib is slow to import
+
+        return plots.comparison(self)
+
+    def __str__(self) -> str:
+        table = Table(
+            "group of statistics", "misfit", title=f"error {self.error:.2f} (1.0: like the model's own samples)"
+        )
+        for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
+            table.add_row(name, f"{misfit:.2f}")
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(table)
+        for sentence in (*self.worst, *self.skipped):
+            console.print(f"- {sentence}", highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+
+def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, progress=None, **keywords) -> Comparison:
+    """Compare a model with measured dark frames, statistic by statistic, against the model's own draws.
+
+    Args:
+        params: any NoiseModel, fitted or from a file.
+        stack: FrameStack, or a bare array with FrameStack's keywords.
+        draws: captures that are drawn from the model as yardstick.
+        seed: of the draws; progress: called with no argument after each.
+
+    Raises:
+        TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
+    """
+    if draws < 8:
+        raise ValueError(f"draws: expected at least 8, got {draws}")
+    stack = as_stack(stack, **keywords)
+    check_fits(params, stack)
+    darks = darks_of(stack)
+    measured = structure(darks, black_level_of(params))
+    own = reference(params, darks, draws, seed, progress or (lambda: None))
+    z = own.z(measured.values)
+    groups = misfits(z, own.groups)
+    worst = max(groups.values())
+    worst_of_draws = np.array([max(misfits(one, own.groups).values()) for one in own.own_z()])
+    table = zip(own.names, own.groups, measured.values, own.mean, z, strict=True)
+    return Comparison(
+        error=worst / float(np.median(worst_of_draws)),
+        groups=groups,
+        table=tuple((name, group, float(a), float(b), float(c)) for name, group, a, b, c in table),
+        worst=_in_words(own.names, measured.values, own.mean, z),
+        p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
+        log_likelihood_per_pixel=_per_pixel(params, darks),
+        skipped=measured.skipped,
+    )
+
+
+def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
+    order = np.argsort(-np.abs(z))[:WORST]
+    return tuple(
+        f"{names[i]}: measured {measured[i]:.3g}, the model gives {model[i]:.3g}"
+        f" ({abs(z[i]):.0f} standard deviations {'above' if z[i] > 0 else 'below'})"
+        for i in order
+        if abs(z[i]) > NOTABLE_Z
+    )
+
+
+def _per_pixel(params: NoiseModel, darks) -> float:
+    try:
+        value = float(log_likelihood(params, darks))
+    except ValueError:  # an effect that states no likelihood
+        return float("nan")
+    return value / (sum(darks.n_frames) * darks.shape[0] * darks.shape[1])

@@ -1,0 +1,190 @@
+"""`improve`: fit, compare, diagnose, add, refit, until nothing is left; held-out frames guard against over-fitting."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise.criticism.compare import Comparison, compare
+from hsnoise.criticism.diagnose import Diagnosis, diagnose
+from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.reference import reference
+from hsnoise.draws import black_level_of, darks_of
+from hsnoise.fit import fit
+from hsnoise.model import NoiseModel
+from hsnoise.result import FitResult
+from hsnoise.stack import FrameStack, as_stack
+from hsnoise.structure import structure
+
+MOST_STEPS = 4
+HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
+HELD_OUT_DRAWS = 40
+WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
+MOVED_SIGMA = 2.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """One turn of the loop.
+
+    Attributes:
+        fit, comparison, diagnosis: of the model at the start of this step (diagnosis None at the end).
+        added: name of the effect that was added to reach this model; None for the first.
+        held_out: synthetic log-likelihood of the held-out frames, nats; NaN without any.
+        moved: base parameters that changed by more than two standard errors in this step, in words.
+    """
+
+    fit: FitResult
+    comparison: Comparison
+    diagnosis: Diagnosis | None
+    added: str | None
+    held_out: float
+    moved: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Story:
+    """The history of `improve`.
+
+    Attributes:
+        steps: from the first fit to the last that was kept.
+        ended: why it ended, in a sentence.
+    """
+
+    steps: tuple[Step, ...]
+    ended: str
+
+    @property
+    def fit(self) -> FitResult:
+        """The last fit that was kept."""
+        return self.steps[-1].fit
+
+    @property
+    def params(self) -> NoiseModel:
+        return self.fit.params
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """`error` of each step."""
+        return tuple(step.comparison.error for step in self.steps)
+
+    def plot(self):
+        """A figure of the error falling: `hsnoise.plots.story`."""
+        from hsnoise import plots  # matplotlib is slow to import
+
+        return plots.story(self)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        table = Table("step", "added", "error", "held-out / nats", "worst group")
+        for i, step in enumerate(self.steps):
+            worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
+            held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
+            table.add_row(str(i), step.added or "the paper's model", f"{step.comparison.error:.2f}", held_out, worst)
+        console.print(table)
+        for i, step in enumerate(self.steps):
+            if step.added:
+                before = self.steps[i - 1]
+                console.print(
+                    f"- Step {i}: added {step.added}, because {_because(before)}; error {before.comparison.error:.2f}"
+                    f" -> {step.comparison.error:.2f}.",
+                    highlight=False,
+                )
+            for sentence in step.moved:
+                console.print(f"  {sentence}", highlight=False)
+        console.print(self.ended, highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+
+def improve(
+    stack, *, model: NoiseModel | None = None, candidates: Any = (), seed: int = 0, progress=None, **keywords
+) -> Story:
+    """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
+
+    Args:
+        stack: FrameStack, or a bare array with FrameStack's keywords.
+        model: where to start; default: all effects of the paper.
+        candidates: effects of your own that may be added, too.
+        seed: of all draws. progress: called with a sentence at each stage.
+
+    Raises:
+        TypeError, ValueError: bad input, before any long work.
+    """
+    say = progress or (lambda sentence: None)
+    stack = as_stack(stack, **keywords)
+    fitted, held_out = _split(darks_of(stack), stack)
+    say("Fitting the paper's model")
+    result = fit(fitted, model=model)
+    steps: list[Step] = [_step(result, fitted, held_out, None, None, seed, say)]
+    while True:
+        if len(steps) > MOST_STEPS:
+            return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.")
+        last = steps[-1]
+        say("Looking for what is missing")
+        own = [c for c in candidates if c.name not in last.fit.params]
+        found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)
+        steps[-1] = last = Step(last.fit, last.comparison, found, last.added, last.held_out, last.moved)
+        if found.best is None:
+            return Story(tuple(steps), _end(found, last.comparison))
+        say(f"Adding {found.best.name}")
+        result = fit(fitted, model=last.fit.params.add(found.best.effect))
+        step = _step(result, fitted, held_out, found.best.name, last, seed, say)
+        if step.held_out - last.held_out < WORSE or step.comparison.error > last.comparison.error:
+            reason = (
+                f"{found.best.name} was tried, but held-out frames or statistics fit worse with it: it was left out"
+            )
+            return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
+        steps.append(step)
+
+
+def _split(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
+    """The stack without the last frames of its darks, and those; all and None if there are too few to spare."""
+    fewest = min(darks.n_frames)
+    spared = max(LEAST_HELD_OUT, int(HELD_OUT_SHARE * fewest))
+    if fewest - spared < LEAST_FITTED or len(set(stack.kind)) > 1 or len(set(darks.n_frames)) > 1:
+        return stack, None
+    return stack.select(frames=slice(0, fewest - spared)), darks.select(frames=slice(fewest - spared, fewest))
+
+
+def _step(result, fitted, held_out, added, before: Step | None, seed: int, say) -> Step:
+    say("Comparing with the model's own samples")
+    comparison = compare(result.params, fitted, seed=seed)
+    likelihood = float("nan") if held_out is None else _held_out(result.params, held_out, seed)
+    return Step(result, comparison, None, added, likelihood, () if before is None else _moved(before.fit, result))
+
+
+def _held_out(model: NoiseModel, frames: FrameStack, seed: int) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of frames that no fit has seen."""
+    own = reference(model, frames, HELD_OUT_DRAWS, seed + 5000)
+    values = structure(frames, black_level_of(model)).values
+    law = shrunk(own.own_z(), np.zeros((1, len(values))))
+    return float(law.log_density(own.z(values)) - np.log(own.deviation).sum())
+
+
+def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
+    moved = []
+    for name in before.names:
+        (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
+        if abs(new - old) > MOVED_SIGMA * max(error, new_error) > 0:
+            moved.append(f"{name} moved from {old:.4g} to {new:.4g} {unit}.")
+    return tuple(moved)
+
+
+def _end(found: Diagnosis, comparison: Comparison) -> str:
+    if found.verdict == "nothing missing":
+        return f"Nothing significant is left (error {comparison.error:.2f})."
+    return f"Something is left that no effect of the library explains (error {comparison.error:.2f}): {found.advice}."
+
+
+def _because(step: Step) -> str:
+    if step.comparison.worst:
+        return step.comparison.worst[0]
+    found = step.diagnosis
+    return f"its fingerprint is in the statistics (score {found.ranking[0].score:.0f} nats)" if found else ""

@@ -1,0 +1,86 @@
+"""Dark captures drawn from a model, like a given one: same exposures, frames, shape and sensor in all exposures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from hsnoise._keys import named_key
+from hsnoise.model import NoiseModel, sample_dark
+from hsnoise.stack import FrameStack
+
+MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
+LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+
+
+def darks_of(stack: FrameStack) -> FrameStack:
+    """The dark exposures of a stack, in memory, cut to what can be drawn many times.
+
+    Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without darks.
+    """
+    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
+    if not darks:
+        raise ValueError("stack: expected dark frames, got flats only")
+    frames = sum(stack.n_frames[i] for i in darks)
+    rows, columns = stack.shape
+    per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(darks) * rows * columns))
+    frames = sum(min(stack.n_frames[i], per_exposure) for i in darks)
+    kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
+    first = 0
+    if kept < columns:
+        first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
+    part = stack.select(frames=slice(0, per_exposure), exposures=darks, columns=(first, min(first + kept, columns)))
+    counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
+    return FrameStack(counts, **_like(part))
+
+
+def check_fits(model: NoiseModel, stack: FrameStack) -> None:
+    """Raise TypeError or ValueError unless `model` can describe the sensor of `stack`."""
+    if not isinstance(model, NoiseModel):
+        raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
+    if (model.cfa, model.shutter) != (stack.cfa, stack.shutter):
+        raise ValueError(
+            f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter}"
+        )
+
+
+def black_level_of(model: NoiseModel) -> np.ndarray:
+    """Black level [channel], DN."""
+    n = len(model.channels)
+    return np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(n)
+
+
+def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
+    """Darks drawn from `model` as `like` was taken: one sensor, every frame new."""
+    key = jax.random.key(seed)
+    sensor_key = named_key(key, "sensor")
+    if "shot_noise" in model:
+        model = model.remove("shot_noise")  # there is no light, and drawing it takes time
+    counts = []
+    for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
+        own = jax.random.fold_in(named_key(key, "frames"), e)
+        drawn = sample_dark(own, frames, like.shape, model, exposure_s=float(exposure_s), sensor_key=sensor_key)
+        counts.append(np.asarray(drawn))
+    return FrameStack(counts, **_like(like))
+
+
+def _like(stack: FrameStack) -> dict[str, Any]:
+    keep = ("exposure_s", "white_level", "cfa", "shutter")
+    return {name: getattr(stack, name) for name in keep}
+
+
+def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:
+    """`function(argument)` for each, on all cores; results in order. NumPy and JAX let other threads work."""
+
+    def one(argument):
+        result = function(argument)
+        tick()
+        return result
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        return list(pool.map(one, arguments))

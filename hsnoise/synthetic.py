@@ -1,0 +1,256 @@
+"""Fitting effects that only say how they are drawn: by simulated statistics, together with the base parameters.
+
+The statistics are those of the capture's structure, and the score (gradient of the exact base likelihood at the base
+fit), which carries all that the likelihood knows of the base parameters. Their expectation and covariance are
+simulated with common random numbers, and the parameters sought at which the expectation meets the measurement
+(efficient method of moments: Gallant and Tauchen, "Which moments to match?", Econometric Theory 12, 1996).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise.coordinates import Coordinates, coordinates_for
+from hsnoise.draws import black_level_of, darks_of, draw_capture, in_threads
+from hsnoise.effects import AbstractEffect
+from hsnoise.maximise import gradient_at, replan
+from hsnoise.model import NoiseModel
+from hsnoise.physics import Physics
+from hsnoise.plan import plan_rules
+from hsnoise.result import FitResult
+from hsnoise.stack import FrameStack
+from hsnoise.statistics import coding_of, summarise, without_counts
+from hsnoise.structure import structure
+
+COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
+ITERATIONS = 3
+STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
+PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
+LONGEST_STEP = 1.5
+SHRINKAGE = 0.1
+FLOOR_DRAWS = 6.0
+MARGIN = 1.15
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One number of an added effect: name in tables, its place, and bounds."""
+
+    label: str
+    effect: str
+    field: str
+    index: tuple[int, ...]
+    low: float | None
+    high: float | None
+
+    def forward(self, value: float) -> float:
+        """The unconstrained number that stands for it: a logarithm above its lower bound, or itself."""
+        return value if self.low is None else float(np.log(max(value - self.low, 1e-9)))
+
+    def inverse(self, x: float) -> float:
+        value = x if self.low is None else self.low + np.exp(np.clip(x, -25, 25))
+        return float(value if self.high is None else min(value, self.high))
+
+    def slope(self, x: float) -> float:
+        """d value / d x."""
+        return 1.0 if self.low is None else float(np.exp(np.clip(x, -25, 25)))
+
+
+def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
+    """The numbers of the effects called `extra`."""
+    found = []
+    for name in extra:
+        effect = model[name]
+        labels = iter(p.name for p in effect.parameters(model.channels))
+        for field, spec in effect.specs().items():
+            places = [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]
+            found += [Knob(next(labels), name, field, place, spec.low, spec.high) for place in places]
+    return found
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained)."""
+
+    darks: FrameStack
+    base: FitResult
+    model: NoiseModel
+    extra: tuple[str, ...]
+    knobs: list[Knob]
+    seed: int
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        physics = replace(self.base.physics, outliers=None)
+        return coordinates_for(self.base.summary, physics)
+
+    @cached_property
+    def centre(self) -> np.ndarray:
+        return np.asarray(self.coordinates.vector(self.coordinates.base))
+
+    @cached_property
+    def whiten(self) -> np.ndarray:
+        """Square root of the covariance of the base coordinates, directions without information cut to 1."""
+        slope = np.maximum(np.abs(np.asarray(self.coordinates.slope(jnp.asarray(self.centre)))), 1e-12)
+        covariance = self.base.covariance / slope[:, None] / slope[None, :]
+        values, vectors = np.linalg.eigh(covariance)
+        return vectors * np.sqrt(np.clip(values, 1e-16, 1.0))
+
+    @cached_property
+    def coding(self):
+        return coding_of(self.darks)
+
+    @cached_property
+    def rules(self):
+        return plan_rules(self.base.physics, summarise(self.darks, coding=self.coding), MARGIN)
+
+    @property
+    def start(self) -> np.ndarray:
+        own = [
+            knob.forward(float(np.asarray(getattr(self.model[knob.effect], knob.field))[knob.index]))
+            for knob in self.knobs
+        ]
+        return np.concatenate([np.zeros(len(self.centre)), own])
+
+    def physics(self, y: np.ndarray) -> Physics:
+        n = len(self.centre)
+        return self.coordinates.physics(jnp.asarray(self.centre + self.whiten @ y[:n]))
+
+    def at(self, y: np.ndarray) -> NoiseModel:
+        """The model whose numbers are y."""
+        physics, model = self.physics(y), self.model
+        values = {
+            ("gain", "value"): physics.gain,
+            ("dark_current", "rate"): physics.dark_current,
+            ("read_noise", "sigma"): physics.read_noise,
+            ("row_gain", "sigma"): physics.row_sigma,
+            ("row_gain", "exponent"): physics.exponent,
+            ("black_level", "value"): physics.black_level,
+        }
+        effects = {effect.name: effect for effect in model}
+        for (name, field), value in values.items():
+            if name in effects and value is not None:
+                effects[name] = _with(effects[name], field, value)
+        for knob, x in zip(self.knobs, y[len(self.centre) :], strict=True):
+            value = np.array(getattr(effects[knob.effect], knob.field), float)
+            value[knob.index] = knob.inverse(x)
+            effects[knob.effect] = _with(effects[knob.effect], knob.field, value)
+        return NoiseModel(effects.values(), cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
+
+    def statistics(self, darks: FrameStack) -> tuple[np.ndarray, np.ndarray]:
+        """Score in whitened units and structure, one after the other, and a rough error of each."""
+        found = structure(darks, black_level_of(self.base.params))
+        summary = summarise(darks, coding=self.coding)
+        with jax.enable_x64(True):
+            physics = jax.tree.map(np.asarray, replace(self.base.physics, outliers=None))
+            rules = replan(self.rules, plan_rules(physics, summary, MARGIN))
+            _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
+            score = self.whiten.T @ np.asarray(gradient)
+        return np.concatenate([score, found.values]), np.concatenate([np.full(len(score), 0.3), found.error])
+
+    def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.statistics(draw_capture(self.seed + number, self.at(y), self.darks))
+
+
+def _with(effect: AbstractEffect, field: str, value) -> AbstractEffect:
+    return eqx.tree_at(lambda e: getattr(e, field), effect, jnp.asarray(value))
+
+
+def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed: int = 0, progress=None) -> FitResult:
+    """`base` with the effects of `model` that it lacks, and base parameters corrected for them.
+
+    base: fit of the same capture without those effects. model: its values are where the search for the effects starts.
+    """
+    darks, tick = darks_of(stack), progress or (lambda: None)
+    extra = tuple(name for name in model.names if name not in base.params)
+    whole = base.params
+    for name in extra:
+        whole = whole.add(model[name])
+    problem = Problem(darks, base, whole, extra, knobs(whole, extra), seed)
+    measured, _ = problem.statistics(darks)
+    y, n = problem.start, len(problem.centre)
+    scale, weight = _weights(problem, y, tick)
+    prior = np.concatenate([np.full(n, 1e-6), np.full(len(problem.knobs), PRIOR_SIGMA**-2)])
+    for _ in range(ITERATIONS):
+        mean, slopes = _mean_and_slopes(problem, y, tick)
+        residual, slopes = (measured - mean) / scale, slopes / scale[:, None]
+        information = slopes.T @ weight @ slopes + np.diag(prior)
+        step = np.linalg.solve(information, slopes.T @ weight @ residual - prior * (y - problem.start))
+        longest = np.abs(step[n:]).max(initial=0.0)
+        y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
+    return _result(
+        problem,
+        y,
+        np.linalg.inv(information),
+        float(np.abs(step / np.sqrt(np.diagonal(np.linalg.inv(information)))).max()),
+    )
+
+
+def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float) -> FitResult:
+    n, base = len(problem.centre), problem.base
+    coordinate = problem.centre + problem.whiten @ y[:n]
+    turn = np.zeros((len(y), len(y)))
+    turn[:n, :n] = np.asarray(problem.coordinates.slope(jnp.asarray(coordinate)))[:, None] * problem.whiten
+    turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
+    return replace(
+        base,
+        params=problem.at(y),
+        physics=jax.tree.map(np.asarray, problem.physics(y)),
+        names=(*base.names, *(knob.label for knob in problem.knobs)),
+        covariance=turn @ covariance @ turn.T,
+        method="synthetic",
+        outcome=f"simulated statistics met: the last step was {last_step:.1g} standard errors long",
+        iterations=ITERATIONS,
+        log_likelihood=float("nan"),
+        notes=_notes(problem, y, covariance),
+    )
+
+
+def _notes(problem: Problem, y: np.ndarray, covariance: np.ndarray) -> tuple[str, ...]:
+    deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
+    loose = [
+        f"{knob.label} is not determined by this capture: its value is close to where the search started."
+        for knob, sigma in zip(problem.knobs, deviation, strict=True)
+        if sigma > 0.7 * PRIOR_SIGMA
+    ]
+    effects = ", ".join(problem.extra)
+    return (
+        f"{effects}: fitted by simulated statistics (synthetic likelihood), together with all other parameters.",
+        *loose,
+    )
+
+
+def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation [statistic] and inverse correlation of the statistics, the noise of simulated means included."""
+    drawn = in_threads(lambda i: problem.draw(y, i), range(COVARIANCE_DRAWS), tick)
+    values, floor = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0)
+    n = len(values)
+    variance = ((n - 1) * values.var(0, ddof=1) + FLOOR_DRAWS * floor**2) / (n - 1 + FLOOR_DRAWS)
+    scale = np.sqrt(variance * (1 + 1 / MEAN_DRAWS))
+    z = (values - values.mean(0)) / np.sqrt(variance)
+    correlation = z.T @ z / (n - 1)
+    # Shrunk to its diagonal: fewer draws than statistics.
+    share = max(SHRINKAGE, min(1.0, len(scale) / (n * 4)))
+    return scale, np.linalg.inv((1 - share) * correlation + share * np.eye(len(scale)) + 0.02 * np.eye(len(scale)))
+
+
+def _mean_and_slopes(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
+    """Expected statistics at y, and their derivatives [statistic, number] by common random numbers."""
+    base = [v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)]
+    steps = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
+
+    def difference(task: tuple[int, int]) -> np.ndarray:
+        which, number = task
+        moved = y.copy()
+        moved[which] += steps[which]
+        return (problem.draw(moved, number)[0] - base[number]) / steps[which]
+
+    tasks = [(which, number) for which in range(len(y)) for number in range(SLOPE_DRAWS)]
+    slopes = np.stack(in_threads(difference, tasks, tick)).reshape(len(y), SLOPE_DRAWS, -1)
+    return np.mean(base, axis=0), slopes.mean(1).T
