@@ -147,8 +147,9 @@ def coding_of(stack: FrameStack) -> Coding:
 def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) -> Summary:
     """One pass over the pixels of `stack`: its row histograms (darks) and photon transfer (flats).
 
-    progress: called with no argument after each frame. coding: bins of another stack, to compare with it. Raises ValueError for frames that cannot be measured
-    (NaN, constant, all zero, saturated) and where nothing is left to fit.
+    progress: called with no argument after each frame. coding: bins of another stack, to compare with it.
+    Raises ValueError for frames that cannot be measured (NaN, constant, all zero, saturated) and where nothing is left
+    to fit.
     """
     tick = progress or (lambda: None)
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]

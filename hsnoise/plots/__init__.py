@@ -1,9 +1,10 @@
-"""Figures of a fit. Each function returns a `matplotlib.figure.Figure`; pyplot and its global state are not used."""
+"""Figures of a fit and of the loop. Each function returns a `matplotlib.figure.Figure`; pyplot and its global state are not used."""
 
 from __future__ import annotations
 
+from hsnoise.plots._criticism import comparison, ranking, story
 from hsnoise.plots._histograms import histograms
 from hsnoise.plots._photon_transfer import photon_transfer
 from hsnoise.plots._row_spectrum import row_spectrum
 
-__all__ = ["histograms", "photon_transfer", "row_spectrum"]
+__all__ = ["comparison", "histograms", "photon_transfer", "ranking", "row_spectrum", "story"]
