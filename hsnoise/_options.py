@@ -15,7 +15,7 @@ CAMERAS = {"canon_5d3": canon_5d3, "grasshopper3": grasshopper3}
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of `hsnoise demo`, `fit` and `sample`; `command` names which, or is None."""
+    """The parser of all commands; `command` names which, or is None."""
     top = argparse.ArgumentParser(
         prog="hsnoise",
         description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
@@ -25,6 +25,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _demo_arguments(commands)
     _fit_arguments(commands)
+    _loop_arguments(commands)
     _sample_arguments(commands)
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -54,6 +55,40 @@ def _fit_arguments(commands: Any) -> None:
     fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
     _capture_arguments(fit)
+
+
+def _loop_arguments(commands: Any) -> None:
+    compare = commands.add_parser(
+        "compare",
+        help="see where a model fails to describe dark frames",
+        description="Compare a model with dark frames: every statistic of the frames against the model's own samples. "
+        "An error of 1 means: as close as those are.",
+    )
+    diagnose = commands.add_parser(
+        "diagnose",
+        help="learn which physical effect a model lacks",
+        description="Name the effect that a fitted model lacks. Without --model the frames are fitted first.",
+    )
+    improve = commands.add_parser(
+        "improve",
+        help="fit, find what is missing, add it, until nothing is left",
+        description="The whole loop: fit the frames, find the effect that the model lacks, add it and fit again, until "
+        "nothing significant is left. Writes model.json, table.csv, story.txt and a figure to a folder.",
+    )
+    for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):
+        if name != "improve":
+            parser.add_argument(
+                "--model",
+                required=name == "compare",
+                help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}",
+            )
+        parser.add_argument(
+            "paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes"
+        )
+        folder = f"hsnoise-{name}"
+        parser.add_argument("--out", type=Path, default=Path(folder), metavar="FOLDER", help=f"default: {folder}")
+        parser.add_argument("--seed", type=int, default=0, help="of the model's samples (default 0)")
+        _capture_arguments(parser)
 
 
 def _capture_arguments(parser: argparse.ArgumentParser) -> None:

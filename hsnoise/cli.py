@@ -1,4 +1,4 @@
-"""The command line: `hsnoise demo`, `hsnoise fit`, `hsnoise sample`."""
+"""The command line: `hsnoise demo`, `fit`, `compare`, `diagnose`, `improve` and `sample`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import argparse
 import csv
 import io
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +126,38 @@ def _fit_and_report(
         console.print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
 
 
+def _compare(args: argparse.Namespace) -> None:
+    _check_folder(args.out)
+    model, stack = _model(args.model), _load(args.paths, args)
+    with _busy("Drawing from the model"):
+        found = hsnoise.compare(model, stack, seed=args.seed)
+    print(found)
+    _write_figure(args.out, "comparison", found)
+
+
+def _diagnose(args: argparse.Namespace) -> None:
+    _check_folder(args.out)
+    stack = _load(args.paths, args)
+    fitted = _fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
+    with _busy("Drawing every effect that may be missing"):
+        found = hsnoise.diagnose(fitted, stack, seed=args.seed)
+    print(found)
+    _write_figure(args.out, "ranking", found)
+
+
+def _improve(args: argparse.Namespace) -> None:
+    _check_folder(args.out)
+    stack = _load(args.paths, args)
+    with _busy("Fitting the paper's model") as say:
+        story = hsnoise.improve(stack, seed=args.seed, progress=say)
+    print(story)
+    print(story.fit)
+    _write_figure(args.out, "story", story)
+    written = _write_results(story.fit, args.out, {"files": args.paths, "errors": list(story.errors)}, figures=False)
+    write_atomically(args.out / "story.txt", f"{story}\n".encode())
+    print(f"Written to {args.out}/: {', '.join(written)}, story.txt, story.png")
+
+
 def _sample(args: argparse.Namespace) -> None:
     suffix = args.out.suffix.lower()
     if suffix not in FRAME_FORMATS:
@@ -188,6 +222,23 @@ def _fit_with_progress(stack: FrameStack, method: str) -> FitResult:
                 progress.add_task("Fitting", total=None)
 
         return hsnoise.fit(stack, method=method, progress=tick)
+
+
+@contextmanager
+def _busy(text: str) -> Iterator[Callable[[str], None]]:
+    """A spinner with the time that has passed; the value changes its text."""
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(text, total=None)
+        yield lambda sentence: progress.update(task, description=sentence)
+
+
+def _write_figure(out: Path, name: str, found) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    found.plot().savefig(buffer, format="png")
+    write_atomically(out / f"{name}.png", buffer.getvalue())
 
 
 def _model(name: str) -> NoiseModel:
@@ -274,8 +325,8 @@ def _rounded(value: float, error: float) -> tuple[str, str]:
     return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
-def _write_results(fit: FitResult, out: Path, source: dict[str, Any]) -> list[str]:
-    """model.json, table.csv and the figures; returns their names."""
+def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bool = True) -> list[str]:
+    """model.json, table.csv and, unless told otherwise, the figures; returns their names."""
     from hsnoise import plots  # matplotlib is slow to import
 
     provenance = {
@@ -290,16 +341,23 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any]) -> list[st
     writer.writerow(["parameter", "value", "standard_error", "unit"])
     writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.table.items())
     write_atomically(out / "table.csv", text.getvalue().encode())
-    figures = {"photon_transfer.png": plots.photon_transfer}
-    if fit.summary.histograms:
-        figures["histograms.png"] = plots.histograms
+    drawings = {"photon_transfer.png": plots.photon_transfer} if figures else {}
+    if figures and fit.summary.histograms:
+        drawings["histograms.png"] = plots.histograms
         if fit.physics.row_sigma is not None:
-            figures["row_spectrum.png"] = plots.row_spectrum
-    for name, draw in figures.items():
+            drawings["row_spectrum.png"] = plots.row_spectrum
+    for name, draw in drawings.items():
         buffer = io.BytesIO()
         draw(fit).savefig(buffer, format="png")
         write_atomically(out / name, buffer.getvalue())
-    return ["model.json", "table.csv", *figures]
+    return ["model.json", "table.csv", *drawings]
 
 
-RUN = {"demo": _demo, "fit": _fit, "sample": _sample}
+RUN = {
+    "demo": _demo,
+    "fit": _fit,
+    "compare": _compare,
+    "diagnose": _diagnose,
+    "improve": _improve,
+    "sample": _sample,
+}

@@ -1,4 +1,4 @@
-"""Figures of a fit and of the loop. Each function returns a `matplotlib.figure.Figure`; pyplot and its global state are not used."""
+"""Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot's global state."""
 
 from __future__ import annotations
 
