@@ -52,7 +52,7 @@ def _fit_arguments(commands: Any) -> None:
         "best at several exposures. Writes model.json, table.csv and figures to a folder."
     )
     fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
-    fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
+    fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or pattern")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
     _capture_arguments(fit)
 

@@ -1,4 +1,4 @@
-"""Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot's global state."""
+"""Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot."""
 
 from __future__ import annotations
 

@@ -1,0 +1,186 @@
+"""A simulator of dark captures with a hidden effect, in NumPy; it shares no code with hsnoise.
+
+`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]. Amplitude 1 of an effect is like
+that of a modest real sensor; its details (period, corner, taps) are drawn from `rng`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Gain [R, G, B] DN/e-, dark current e-/s, read noise e-, row gain sigma [R, G, B], 1/f rows or white, black DN."""
+
+    gain: tuple[float, ...]
+    dark: float
+    read: float
+    row_sigma: tuple[float, ...]
+    rolling: bool
+    black: float
+
+
+CANON = Camera((1.53, 1.23, 1.31), 51.7, 12.5**0.5, (0.197**0.5, 0.039**0.5, 0.013**0.5), True, 0.0)
+GRASSHOPPER = Camera((3.54, 3.11, 3.95), 118.0, 5.43**0.5, (0.09, 0.0069**0.5, 0.026**0.5), False, 64.0)
+
+# Amplitude 1 in each effect's own measure.
+MODEST = {
+    "row_noise": 1.0,  # e-
+    "column_noise": 0.8,
+    "row_fixed_pattern": 0.6,
+    "column_fixed_pattern": 0.6,
+    "frame_offset": 0.4,
+    "dark_signal_nonuniformity": 1.5,
+    "hot_pixels": 0.004,  # of the pixels
+    "amplifier_glow": 60.0,  # e-/s in the corner
+    "dark_current_drift": 0.25,  # relative, over the frames of an exposure
+    "random_telegraph_noise": 0.03,  # of the pixels, 12 e-
+    "heavy_tailed_read_noise": 5.0,  # degrees of freedom
+    "read_noise_nonuniformity": 0.35,
+    "periodic_banding": 0.8,  # e-
+    "crosstalk": 0.02,
+    "readout_bandwidth": 0.05,
+    "image_lag": 0.04,
+    "odd_even_pattern": 0.8,  # e-
+    "tap_offsets": 0.8,  # e-
+    "missing_codes": 1.6,  # digital gain
+    "cosmic_rays": 60.0,  # hits per Mpixel and frame
+    "shared_row_gain": 0.12,
+}
+ODD = ("ramp_37_rows", "block_offsets", "read_noise_along_row", "gain_vignette")
+
+
+def colour_of(shape: tuple[int, int]) -> np.ndarray:
+    """Channel of each pixel of an RGGB sensor, [row, column]."""
+    tile = np.array([[0, 1], [1, 2]])
+    return np.tile(tile, (shape[0] // 2, shape[1] // 2))
+
+
+def series(rng, frames: int, n: int, exponent: float) -> np.ndarray:
+    """Normal series [frame, n] of unit variance, white or of power 1/f^exponent without DC."""
+    if exponent == 0:
+        return rng.standard_normal((frames, n))
+    f = np.fft.rfftfreq(n, 1 / n)
+    amplitude = np.zeros(len(f))
+    amplitude[1:] = f[1:] ** (-exponent / 2)
+    modes = rng.standard_normal((frames, len(f))) + 1j * rng.standard_normal((frames, len(f)))
+    modes[:, -1] = modes[:, -1].real * np.sqrt(2)
+    power = (amplitude[1:-1] ** 2).sum() * 2 + amplitude[-1] ** 2
+    return np.fft.irfft(modes * amplitude, n, axis=1) * n / np.sqrt(2 * power)
+
+
+def capture(camera: Camera, effect: str | None, amplitude: float, rng, *, frames=8, shape=(160, 240)) -> np.ndarray:
+    """Counts [exposure, frame, row, column] of an RGGB sensor with `effect` hidden in it (None: nothing)."""
+    size = MODEST.get(effect, 1.0) * amplitude if effect != "heavy_tailed_read_noise" else MODEST[effect] / amplitude
+    hidden = _static(effect, size, camera, rng, shape)
+    return np.stack([_exposure(camera, effect, size, hidden, t, rng, frames, shape) for t in EXPOSURE_S])
+
+
+def _static(effect: str | None, size: float, camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
+    """What stays the same in all frames of the sensor."""
+    rows, columns = shape
+    r, c = np.mgrid[0:rows, 0:columns]
+    out: dict[str, np.ndarray | float] = {}
+    if effect == "row_fixed_pattern":
+        out["offset"] = size * rng.standard_normal((rows, 1))
+    elif effect == "column_fixed_pattern":
+        out["offset"] = size * rng.standard_normal((1, columns))
+    elif effect == "dark_signal_nonuniformity":
+        out["offset"] = size * rng.standard_normal(shape)
+    elif effect == "odd_even_pattern":
+        out["offset"] = size * ((c // 2) % 2 - 0.5)
+    elif effect == "tap_offsets":
+        taps = int(rng.choice([2, 4, 8]))
+        levels = rng.standard_normal(taps)
+        levels = (levels - levels.mean()) / max(levels.std(), 0.3)
+        out["offset"] = size * levels[c * taps // columns]
+    elif effect == "hot_pixels":
+        hot = rng.random(shape) < size
+        out["rate"] = hot * rng.exponential(rng.uniform(200, 800), shape)
+    elif effect == "amplifier_glow":
+        far = np.hypot((r - rng.choice([0, rows - 1])) / rows, (c - rng.choice([0, columns - 1])) / columns)
+        out["rate"] = size * np.exp(-far / rng.uniform(0.2, 0.5))
+    elif effect == "random_telegraph_noise":
+        out["jumping"] = rng.random(shape) < size
+        out["duty"] = float(rng.uniform(0.25, 0.75))
+    elif effect == "read_noise_nonuniformity":
+        spread = np.exp(size * rng.standard_normal(shape))
+        out["read"] = spread / np.sqrt((spread**2).mean())
+    elif effect == "periodic_banding":
+        out["frequency"] = float(rng.uniform(0.03, 0.45))
+    elif effect == "block_offsets":
+        out["offset"] = 0.8 * size * rng.standard_normal((rows // 64 + 1, columns // 64 + 1))[r // 64, c // 64]
+    elif effect == "read_noise_along_row":
+        spread = 1 + 0.6 * size * (c / columns - 0.5)
+        out["read"] = spread / np.sqrt((spread**2).mean())
+    elif effect == "gain_vignette":
+        far = ((r - rows / 2) / rows) ** 2 + ((c - columns / 2) / columns) ** 2
+        out["gain"] = 1 - 0.5 * size * (far - far.mean())
+    return out
+
+
+def _exposure(camera: Camera, effect, size, hidden, t: float, rng, frames: int, shape) -> np.ndarray:
+    rows, columns = shape
+    whole = (frames, *shape)
+    rate = camera.dark + hidden.get("rate", 0.0)
+    if effect == "dark_current_drift":
+        rate = rate * (1 + size * (np.arange(frames)[:, None, None] / max(frames - 1, 1) - 0.5))
+    x = rng.poisson(np.broadcast_to(rate * t, whole)).astype(float)
+    if effect == "cosmic_rays":
+        x += (rng.random(whole) < size * 1e-6) * rng.exponential(120.0, whole)
+    if effect == "crosstalk":
+        padded = np.pad(x, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        around = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+        x = (1 - 4 * size) * x + size * around
+    if effect == "image_lag":
+        x[1:] = (1 - size) * x[1:] + size * x[:-1]
+    noise = rng.standard_normal(whole)
+    if effect == "heavy_tailed_read_noise":
+        noise = rng.standard_t(size, whole) * np.sqrt((size - 2) / size)
+    x += camera.read * noise * hidden.get("read", 1.0) + hidden.get("offset", 0.0)
+    x += _moving(effect, size, hidden, rng, frames, shape)
+    if effect == "readout_bandwidth":
+        x[:, :, 1:] = (1 - size) * x[:, :, 1:] + size * x[:, :, :-1]
+    return _digital(camera, effect, size, x * hidden.get("gain", 1.0), rng)
+
+
+def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float:
+    """Offsets that are new in each frame, e-."""
+    rows, columns = shape
+    if effect == "row_noise":
+        return size * rng.standard_normal((frames, rows, 1))
+    if effect == "column_noise":
+        return size * rng.standard_normal((frames, 1, columns))
+    if effect == "frame_offset":
+        return size * rng.standard_normal((frames, 1, 1))
+    if effect == "periodic_banding":
+        phase = rng.uniform(0, 2 * np.pi, (frames, 1, 1))
+        return size * np.sin(2 * np.pi * hidden["frequency"] * np.arange(rows)[None, :, None] + phase)
+    if effect == "random_telegraph_noise":
+        return 12.0 * hidden["jumping"] * (rng.random((frames, *shape)) < hidden["duty"])
+    if effect == "ramp_37_rows":
+        return (1.5 * size * ((np.arange(rows) % 37) / 37 - 0.5))[None, :, None]
+    return 0.0
+
+
+def _digital(camera: Camera, effect, size, x: np.ndarray, rng) -> np.ndarray:
+    """Gain, row gain, black level, codes."""
+    frames, rows, _ = x.shape
+    colour = colour_of(x.shape[1:])
+    shared = np.zeros((frames, rows))
+    if effect == "shared_row_gain":
+        shared = size * series(rng, frames, rows, float(camera.rolling))
+    y = np.empty_like(x)
+    for c in range(3):
+        beta = 1 + camera.row_sigma[c] * series(rng, frames, rows, float(camera.rolling))
+        beta = np.maximum(beta, 0) * np.maximum(1 + shared, 0)
+        y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x, y)
+    counts = np.clip(np.rint(y + camera.black), 0, 65535)
+    if effect == "missing_codes":
+        counts = np.clip(np.rint(np.rint(counts / size) * size), 0, 65535)
+    return counts.astype(np.uint16)
