@@ -13,7 +13,7 @@ import hsnoise
 
 ROOT = Path(hsnoise.__file__).parent
 # A module may import those before it, and its own package.
-ORDER = """_types _keys _numerics _frames _arguments _output stack io effects model cameras photometry statistics
+ORDER = """_types _keys _numerics _frames _arguments _output stack io effects model cameras photometry statistics structure
     rows physics moments plan likelihood coordinates maximise profile result notes lut
     line_spectrum line fit plots _options cli""".split()
 IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames"}
