@@ -1,0 +1,78 @@
+"""What one exposure gives, and how the exposures of one half are averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+TINY_DN2 = 1e-4  # far below the variance of rounding: keeps logarithms of empty variances finite
+LARGEST_CORRELATION = 0.9999
+
+
+def log_ratio(above: np.ndarray, below: np.ndarray | float) -> np.ndarray:
+    """Log of a ratio of two variances, DN^2, or of two numbers of order one."""
+    return np.log((np.asarray(above, np.float64) + TINY_DN2) / (np.asarray(below, np.float64) + TINY_DN2))
+
+
+def fisher(correlation: np.ndarray) -> np.ndarray:
+    """artanh of correlations: standard error 1/sqrt(n) whatever their size."""
+    return np.arctanh(np.clip(correlation, -LARGEST_CORRELATION, LARGEST_CORRELATION))
+
+
+def correlation(a: np.ndarray, b: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """artanh of the uncentred correlation of two arrays over `axes`; 0 where one of them is all zero."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    power = (a * a).sum(axes) * (b * b).sum(axes)
+    return fisher((a * b).sum(axes) / np.sqrt(np.maximum(power, 1e-60)))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A statistic of one exposure: a value with its standard error, or a number of rare pixels."""
+
+    value: float
+    error: float
+    is_count: bool = False
+
+
+@dataclass
+class Sheet:
+    """The statistics of one exposure by (group, what). `letters` [plane] is the colour of each plane."""
+
+    letters: tuple[str, ...]
+    entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
+
+    def add(self, group: str, what: str, values: np.ndarray | float, error: float) -> None:
+        """The mean of `values` over whatever axes they have; `error` is that of the mean."""
+        self.entries[group, what] = Entry(float(np.mean(values)), float(error))
+
+    def add_count(self, group: str, what: str, number: float) -> None:
+        self.entries[group, what] = Entry(float(number), 0.5, is_count=True)
+
+    def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
+        """One statistic a colour from values [plane]; `error` is that of one plane."""
+        for colour in dict.fromkeys(self.letters):
+            of = [i for i, letter in enumerate(self.letters) if letter == colour]
+            name = what if colour == "mono" else f"{what}, {colour}"
+            self.add(group, name, np.asarray(values)[of], error / np.sqrt(len(of)))
+
+
+def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
+    """The statistics of the exposures of one half: means, and square roots of summed numbers.
+
+    An exposure of few frames has fewer statistics than others: the mean is over those that have one.
+    """
+    keys = dict.fromkeys(key for sheet in sheets for key in sheet.entries)
+    out = {}
+    for group, what in keys:
+        found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
+        values = np.array([entry.value for entry in found])
+        if found[0].is_count:
+            entry = Entry(float(np.sqrt(values.sum())), 0.5)
+        else:
+            errors = np.array([entry.error for entry in found])
+            entry = Entry(float(values.mean()), float(np.sqrt((errors**2).sum()) / len(found)))
+        out[group, f"{what}, {half}"] = entry
+    return out
