@@ -105,7 +105,7 @@ def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: expected numbers, got {value!r}") from error
     if array.shape != (length,):
-        raise ValueError(f"{name}: expected {length} (one a {per}), got shape {array.shape}: {value!r}")
+        raise ValueError(f"{name}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
     array.setflags(write=False)
     return array
 

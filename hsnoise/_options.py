@@ -141,7 +141,10 @@ def _sample_arguments(commands: Any) -> None:
 
 
 def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split(",")]
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number or several with commas, got {text!r}") from None
 
 
 def _cfa(text: str) -> str:

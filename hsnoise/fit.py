@@ -52,6 +52,8 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    if model is not None and not isinstance(model, NoiseModel):
+        raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
     extra = () if model is None else tuple(name for name in model.names if name not in BASE_NAMES)
     if extra:
         return _with_effects(stack, model, extra, method, progress, keywords)

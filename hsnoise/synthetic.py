@@ -138,9 +138,9 @@ class Problem:
             if name in effects and value is not None:
                 effects[name] = _with(effects[name], field, value)
         for knob, x in zip(self.knobs, y[len(self.centre) :], strict=True):
-            value = np.array(getattr(effects[knob.effect], knob.field), float)
-            value[knob.index] = knob.inverse(x)
-            effects[knob.effect] = _with(effects[knob.effect], knob.field, value)
+            moved = np.array(getattr(effects[knob.effect], knob.field), float)
+            moved[knob.index] = knob.inverse(x)
+            effects[knob.effect] = _with(effects[knob.effect], knob.field, moved)
         return NoiseModel(effects.values(), cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
 
     def statistics(self, darks: FrameStack) -> tuple[np.ndarray, np.ndarray]:

@@ -20,8 +20,9 @@ from hsnoise.criticism.candidates import Maker, built_in, given
 from hsnoise.criticism.fingerprint import GRID, Fingerprint, base_slopes, fingerprint
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.reference import Reference, reference
-from hsnoise.draws import black_level_of, darks_of
+from hsnoise.draws import black_level_of, check_fits, darks_of
 from hsnoise.effects import AbstractEffect
+from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
 from hsnoise.structure import structure
@@ -120,8 +121,12 @@ def diagnose(
     tick = progress or (lambda: None)
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
+    if not isinstance(model, NoiseModel):
+        raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
+    check_fits(model, stack)
+    own = _own(candidates, model)
     darks = darks_of(stack)
-    makers = built_in(model, darks) | _own(candidates, model)
+    makers = built_in(model, darks) | own
     base = reference(model, darks, draws, seed, tick)
     z = base.z(structure(darks, black_level_of(model)).values)
     slopes = base_slopes(model, darks, base, seed, tick)
@@ -170,10 +175,11 @@ def _verdict(ranking: tuple[Candidate, ...], z: np.ndarray, null: Gaussian, base
     scores = null.normal_scores(z, base.groups)
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
     there = first.score > EVIDENCE
+    names: tuple[str, ...] = ()
     if not there and max(scores.values()) <= MISFIT:
-        verdict, names = "nothing missing", ()
+        verdict = "nothing missing"
     elif not there or first.misfit > MISFIT_LEFT:
-        verdict, names = "unexplained", ()
+        verdict = "unexplained"
     elif first.name in ALIKE or (second is not None and first.score - second.score < AMBIGUOUS):
         names = (first.name, ALIKE[first.name][0] if first.name in ALIKE else second.name)
         verdict = "ambiguous"

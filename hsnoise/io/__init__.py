@@ -101,6 +101,8 @@ def load(
 def _paths(path: Any) -> list[Path]:
     """The files meant, of known formats in a folder, of any in a list."""
     if not isinstance(path, str | Path):
+        if not isinstance(path, Iterable):
+            raise TypeError(f"path: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}")
         paths = [Path(one) for one in path]
     elif Path(path).is_dir():
         found = [one for one in Path(path).iterdir() if one.is_file() and not one.name.startswith(".")]
@@ -209,7 +211,7 @@ def _black_level(read: list[Recording]) -> Any:
 
 def _region(counts: list[Any], cfa: str, roi: tuple[Any, Any], row_axis: int) -> tuple[list[Any], str]:
     """Counts and Bayer order of a region, all in stored orientation; `roi` is in sensor orientation."""
-    if len(roi) != 2:
+    if not isinstance(roi, Sequence) or len(roi) != 2:
         raise ValueError(f"roi: expected ((first row, end row), (first column, end column)), got {roi!r}")
     sizes = counts[0].shape[1:]
     spans = roi[::-1] if row_axis == 1 else roi

@@ -1,0 +1,184 @@
+"""Compare, diagnose and improve: quiet on what the model explains, loud and right on what it does not."""
+
+from __future__ import annotations
+
+import importlib
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise import effects as fx
+from hsnoise.criticism import candidates as library
+from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.draws import darks_of, draw_capture
+
+MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
+EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
+FEW = ("row_noise", "dark_signal_nonuniformity", "frame_offset", "hot_pixels", "crosstalk", "periodic_banding")
+
+
+def empty_stack(frames=4, shape=(96, 128), model=MODEL, exposure_s=EXPOSURE_S):
+    """A stack that only says how a capture is taken."""
+    rng = np.random.default_rng(0)
+    counts = [rng.integers(60, 80, (frames, *shape)).astype(np.uint16) for _ in exposure_s]
+    return hsnoise.FrameStack(counts, exposure_s, cfa=model.cfa, shutter=model.shutter)
+
+
+def capture(*effects, seed=900, **layout):
+    model = MODEL
+    for effect in effects:
+        model = model.add(effect)
+    return draw_capture(seed, model, empty_stack(**layout))
+
+
+@pytest.fixture
+def few_candidates(monkeypatch):
+    """A library of six effects, for time's sake."""
+    whole = library.built_in
+
+    def some(model, darks):
+        return {name: maker for name, maker in whole(model, darks).items() if name in FEW}
+
+    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.diagnose"), "built_in", some)
+
+
+def test_own_samples_have_error_one():
+    errors = [hsnoise.compare(MODEL, capture(seed=900 + i), draws=24).error for i in range(6)]
+    assert 0.6 < np.median(errors) < 1.6
+    assert max(errors) < 4
+
+
+@pytest.mark.parametrize(
+    ("effect", "group"),
+    [
+        (fx.RowNoise(1.0), {"row x frame", "row spectrum", "noise"}),
+        (fx.DarkSignalNonuniformity(1.5), {"static pixels", "noise"}),
+        (fx.FrameOffset(1.0), {"frames over time"}),
+        (fx.ColumnFixedPattern(1.0), {"static columns"}),
+        (fx.HotPixels(0.01, 600.0), {"tails", "pixels over time", "static pixels"}),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_hidden_effect_shows_in_its_group(effect, group):
+    found = hsnoise.compare(MODEL, capture(effect), draws=24)
+    assert found.error > 4 and found.p_value < 0.05
+    worst = sorted(found.groups, key=found.groups.__getitem__)[-3:]
+    assert group & set(worst)
+    assert found.worst and "standard deviations" in found.worst[0]
+    assert f"{found.error:.2f}" in str(found)
+
+
+def test_likelihood_per_pixel_prefers_the_truth():
+    stack = capture()
+    wrong = hsnoise.cameras.grasshopper3(black_level_dn=66)
+    right = hsnoise.compare(MODEL, stack, draws=8).log_likelihood_per_pixel
+    assert right > hsnoise.compare(wrong, stack, draws=8).log_likelihood_per_pixel
+    assert np.isnan(hsnoise.compare(MODEL.add(fx.RowNoise(0.1)), stack, draws=8).log_likelihood_per_pixel)
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [
+        (fx.RowNoise(1.0), "row_noise"),
+        (fx.DarkSignalNonuniformity(1.2), "dark_signal_nonuniformity"),
+        (fx.HotPixels(0.006, 800.0), "hot_pixels"),
+    ],
+    ids=["row_noise", "dsnu", "hot"],
+)
+def test_hidden_effect_is_named(effect, name, few_candidates):
+    found = hsnoise.diagnose(MODEL, capture(effect), draws=40)
+    assert found.verdict == "named" and found.best.name == name and found.names == (name,)
+    assert found.best.p_value < 0.01
+    hsnoise.sample(jax.random.key(0), np.zeros((8, 8)), MODEL.add(found.best.effect))  # ready to add
+
+
+def test_clean_capture_misses_nothing(few_candidates):
+    found = hsnoise.diagnose(MODEL, capture(), draws=40)
+    assert found.verdict == "nothing missing" and found.best is None and found.names == ()
+    assert "nothing missing" in str(found)
+
+
+def test_effect_outside_the_library_is_unexplained(few_candidates):
+    stack = capture()
+    ramp = np.rint(8 * ((np.arange(96) % 37) / 37 - 0.5))[None, :, None]
+    counts = [np.asarray(c + ramp, np.int32).astype(np.uint16) for c in stack.counts]
+    odd = hsnoise.FrameStack(counts, EXPOSURE_S, cfa=MODEL.cfa, shutter=MODEL.shutter)
+    found = hsnoise.diagnose(MODEL, odd, draws=40)
+    assert found.verdict == "unexplained" and found.best is None
+    assert found.unexplained.misfit > 3 and found.unexplained.statistics
+
+
+class DiagonalStreaks(hsnoise.AbstractEffect):
+    """An effect of a user's: pixels of one diagonal share an offset, new in each frame."""
+
+    name: ClassVar[str] = "diagonal_streaks"
+    stage: ClassVar[hsnoise.Stage] = hsnoise.Stage.READ
+    sigma: jax.Array = hsnoise.param("e-", low=0, doc="standard deviation over diagonals")
+
+    def sample(self, signal, capture, *, key):
+        frames, rows, columns = signal.shape
+        offsets = jax.random.normal(key, (frames, rows + columns), signal.dtype)
+        diagonal = np.arange(rows)[:, None] + np.arange(columns)[None, :]
+        return signal + self.sigma * jnp.take(offsets, diagonal, axis=1)
+
+
+def test_effect_of_a_user_is_named(few_candidates):
+    found = hsnoise.diagnose(MODEL, capture(DiagonalStreaks(1.2)), candidates=[DiagonalStreaks(1.0)], draws=40)
+    assert found.best is not None and found.best.name == "diagonal_streaks"
+
+
+@pytest.mark.slow
+def test_added_effect_is_fitted_with_the_base():
+    stack = capture(fx.RowNoise(1.0), frames=6)
+    result = hsnoise.fit(stack, model=MODEL.add(fx.RowNoise(0.5)))
+    assert result.method == "synthetic"
+    truth = {name: value for name, (value, _) in MODEL.add(fx.RowNoise(1.0)).table().items()}
+    for name in (*[n for n in result.names if n.startswith(("gain", "dark", "read"))], "row_noise.sigma"):
+        value, error, _ = result.table[name]
+        assert abs(value - truth[name]) < 4.5 * error, name
+    assert result.table["row_noise.sigma"][1] < 0.2
+
+
+@pytest.mark.slow
+def test_improve_finds_adds_and_ends(few_candidates):
+    story = hsnoise.improve(capture(fx.DarkSignalNonuniformity(1.5), frames=8))
+    assert [step.added for step in story.steps] == [None, "dark_signal_nonuniformity"]
+    assert story.errors[0] > 4 and story.errors[1] < 2.5
+    assert "dark_signal_nonuniformity" in str(story) and "->" in str(story)
+
+
+def test_shrunk_law_is_that_of_its_draws():
+    rng = np.random.default_rng(3)
+    z = rng.standard_normal((4000, 6)) @ np.linalg.cholesky(0.5 * np.eye(6) + 0.5).T
+    law = shrunk(z, np.zeros((1, 6)))
+    np.testing.assert_allclose(law.covariance, 0.5 * np.eye(6) + 0.5, atol=0.12)
+    exact = Gaussian(np.zeros(6), np.eye(6))
+    assert exact.log_density(np.ones(6)) == pytest.approx(-3.0)
+    assert abs(exact.normal_scores(np.ones(6), ("a",) * 6)["a"]) < 1
+
+
+def test_large_captures_are_cut_but_keep_their_rows():
+    big = empty_stack(frames=3, shape=(1200, 1600), exposure_s=(0.1,))
+    cut = darks_of(big)
+    assert cut.shape[0] == 1200 and cut.shape[1] < 1600 and cut.shape[1] % 2 == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda s: hsnoise.compare(hsnoise.cameras.canon_5d3(), s), ValueError, "shutter"),
+        (lambda s: hsnoise.compare("camera.json", s), TypeError, "NoiseModel"),
+        (lambda s: hsnoise.compare(MODEL, s, draws=2), ValueError, "draws"),
+        (lambda s: hsnoise.diagnose(MODEL, s, candidates=[3]), TypeError, "candidates"),
+        (lambda s: hsnoise.diagnose(MODEL, s, candidates=[fx.Gain(2.0)]), ValueError, "gain"),
+        (lambda s: hsnoise.diagnose(3, s), TypeError, "fit"),
+        (lambda s: hsnoise.fit(hsnoise.summarise(s), model=MODEL.add(fx.RowNoise(0.1))), ValueError, "frames"),
+    ],
+)
+def test_bad_input_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call(empty_stack(frames=2, shape=(32, 32)))
