@@ -43,27 +43,50 @@ CAMERAS = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compile_quickly():
-    """Two dozen programs, each run a few times."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+# All effects with nothing to do: one program draws a clean capture and, with one replaced, that of each effect.
+NOTHING = (
+    SharedRowGain(0.0),
+    RowNoise(0.0),
+    ColumnNoise(0.0),
+    RowFixedPattern(0.0),
+    ColumnFixedPattern(0.0),
+    FrameOffset(0.0),
+    DarkSignalNonuniformity(0.0),
+    HotPixels(0.0, 0.0),
+    AmplifierGlow(0.0, 0.3),
+    RandomTelegraphNoise(0.0, 0.0, 0.4),
+    HeavyTailedReadNoise(1e6),
+    ReadNoiseNonuniformity(0.0),
+    PeriodicBanding(0.0, 0.13),
+    Crosstalk(0.0),
+    ReadoutBandwidth(0.0),
+    ImageLag(0.0),
+    OddEvenPattern(0.0),
+    TapOffsets(0.0, taps=4),
+    MissingCodes(1.0),
+    CosmicRays(0.0, 1.0),
+    BlackClamp([0.0, 0.0, 0.0]),
+)
+
+
+def model_with(camera, effect):
+    """The camera with one effect; the Grasshopper's always holds all of NOTHING, in one order."""
+    model, _ = CAMERAS[camera]
+    if camera == "grasshopper3":
+        for nothing in NOTHING:
+            model = model.add(effect if effect is not None and effect.name == nothing.name else nothing)
+        return model
+    return model if effect is None else model.add(effect)
 
 
 def draw(camera, effect=None, seed=0):
-    model, black = CAMERAS[camera]
-    model = model if effect is None else model.add(effect)
+    model, black = model_with(camera, effect), CAMERAS[camera][1]
     key, sensor = jax.random.key(seed), jax.random.key(1000 + seed)
-    counts = [
-        np.asarray(
-            hsnoise.sample_dark(
-                jax.random.fold_in(key, i), FRAMES, SHAPE, model, exposure_s=np.float32(t), sensor_key=sensor
-            )
-        )
-        for i, t in enumerate(EXPOSURE_S)
-    ]
+    counts = []
+    for i, t in enumerate(EXPOSURE_S):
+        of = jax.random.fold_in(key, i)
+        frames = hsnoise.sample_dark(of, FRAMES, SHAPE, model, exposure_s=np.float32(t), sensor_key=sensor)
+        counts.append(np.asarray(frames))
     stack = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=black, cfa="RGGB", shutter=model.shutter)
     return structure(stack, np.full(3, black))
 
@@ -167,9 +190,10 @@ def test_clean_draws_have_no_correlations(camera):
     names, mean, spread = clean(camera)
     words = ("correlation of exposures", "correlation, same", "columns away", "coherence")
     some = [i for i, name in enumerate(names) if any(word in name for word in words)]
-    z = mean[some] / spread[some] * np.sqrt(CLEAN)
+    # Row gains weigh rows: what a sum of zero takes from correlations is then known to a few thousandths only.
+    z = np.abs(mean[some]) / (4.5 * spread[some] / np.sqrt(CLEAN) + 0.004)
     assert len(z) > 40
-    assert np.abs(z).max() < 5.0, names[some[int(np.argmax(np.abs(z)))]]
+    assert z.max() < 1, names[some[int(np.argmax(z))]]
 
 
 # Effect, the statistic that must react, and its direction.
@@ -187,7 +211,6 @@ REACTIONS = [
     (HeavyTailedReadNoise(4.0), "tails: log kurtosis, G, low", 1),
     (ReadNoiseNonuniformity(0.4), "pixels over time: correlation of exposures, log variance, low-low", 1),
     (PeriodicBanding(1.5, 0.13), "row spectrum: peak of the spectrum, low", 1),
-    (PeriodicBanding(1.0, 0.13, axis="column"), "column x frame: peak of the spectrum, all", 1),
     (Crosstalk(0.04), "spatial lags: residual, 1 rows 0 columns away, high", 1),
     (ReadoutBandwidth(0.06), "spatial lags: residual, 0 rows 1 columns away, low", 1),
     (ImageLag(0.1), "pixels over time: residual, next frame, high", 1),
