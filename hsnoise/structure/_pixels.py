@@ -24,6 +24,8 @@ def levels(sheet: Sheet, x: Exposure, white_level: float | None) -> None:
     n = frames * rows * columns
     sheet.add_colours("level", "mean above black, DN", x.mean, float(np.sqrt(x.variance.mean() / n)))
     sheet.add_colours("noise", "log variance", np.log(x.variance + TINY_DN2), np.sqrt(2 / n))
+    robust = np.log(np.square(x.scale).mean((1, 2), dtype=np.float64) + TINY_DN2)
+    sheet.add_colours("noise", "log variance without outliers", robust, np.sqrt(2 / n))
     if planes == 4:
         greens = [i for i, letter in enumerate(sheet.letters) if letter == "G"]
         step = (x.mean[greens[0]] - x.mean[greens[1]]) / np.sqrt(x.variance.mean() + TINY_DN2)

@@ -1,0 +1,258 @@
+"""Statistics that tell effects apart: the same for every capture of one layout, zero where nothing is, and sharp."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise.effects import (
+    AmplifierGlow,
+    BlackClamp,
+    ColumnFixedPattern,
+    ColumnNoise,
+    CosmicRays,
+    Crosstalk,
+    DarkSignalNonuniformity,
+    FrameOffset,
+    HeavyTailedReadNoise,
+    HotPixels,
+    ImageLag,
+    MissingCodes,
+    OddEvenPattern,
+    PeriodicBanding,
+    RandomTelegraphNoise,
+    ReadNoiseNonuniformity,
+    ReadoutBandwidth,
+    RowFixedPattern,
+    RowNoise,
+    SharedRowGain,
+    TapOffsets,
+)
+from hsnoise.structure import _anova, structure
+
+SHAPE, FRAMES, EXPOSURE_S = (96, 128), 6, (0.01, 0.03, 0.1, 0.2)
+CLEAN = 12
+CAMERAS = {
+    "grasshopper3": (hsnoise.cameras.grasshopper3(black_level_dn=64.0), 64.0),
+    "canon_5d3": (hsnoise.cameras.canon_5d3(), 0.0),
+}
+
+
+# All effects with nothing to do: one program draws a clean capture and, with one replaced, that of each effect.
+NOTHING = (
+    SharedRowGain(0.0),
+    RowNoise(0.0),
+    ColumnNoise(0.0),
+    RowFixedPattern(0.0),
+    ColumnFixedPattern(0.0),
+    FrameOffset(0.0),
+    DarkSignalNonuniformity(0.0),
+    HotPixels(0.0, 0.0),
+    AmplifierGlow(0.0, 0.3),
+    RandomTelegraphNoise(0.0, 0.0, 0.4),
+    HeavyTailedReadNoise(1e6),
+    ReadNoiseNonuniformity(0.0),
+    PeriodicBanding(0.0, 0.13),
+    Crosstalk(0.0),
+    ReadoutBandwidth(0.0),
+    ImageLag(0.0),
+    OddEvenPattern(0.0),
+    TapOffsets(0.0, taps=4),
+    MissingCodes(1.0),
+    CosmicRays(0.0, 1.0),
+    BlackClamp([0.0, 0.0, 0.0]),
+)
+
+
+def model_with(camera, effect):
+    """The camera with one effect; the Grasshopper's always holds all of NOTHING, in one order."""
+    model, _ = CAMERAS[camera]
+    if camera == "grasshopper3":
+        for nothing in NOTHING:
+            model = model.add(effect if effect is not None and effect.name == nothing.name else nothing)
+        return model
+    return model if effect is None else model.add(effect)
+
+
+def draw(camera, effect=None, seed=0):
+    model, black = model_with(camera, effect), CAMERAS[camera][1]
+    key, sensor = jax.random.key(seed), jax.random.key(1000 + seed)
+    counts = []
+    for i, t in enumerate(EXPOSURE_S):
+        of = jax.random.fold_in(key, i)
+        frames = hsnoise.sample_dark(of, FRAMES, SHAPE, model, exposure_s=np.float32(t), sensor_key=sensor)
+        counts.append(np.asarray(frames))
+    stack = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=black, cfa="RGGB", shutter=model.shutter)
+    return structure(stack, np.full(3, black))
+
+
+@cache
+def clean(camera):
+    """(mean, spread) of the statistics of clean draws, by name."""
+    draws = [draw(camera, seed=seed) for seed in range(CLEAN)]
+    values = np.stack([d.values for d in draws])
+    spread = np.maximum(values.std(0, ddof=1), draws[0].error)
+    return draws[0].names, values.mean(0), spread
+
+
+def noise(rng, frames, shape, cfa="mono", *, mean=100.0, sigma=4.0, exposure_s=None, black=64.0):
+    """A capture of independent normal pixels, DN."""
+    counts = [np.clip(np.rint(rng.normal(mean, sigma, (n, *shape))), 0, None).astype(np.uint16) for n in frames]
+    times = np.arange(1, len(frames) + 1) / 100 if exposure_s is None else exposure_s
+    return hsnoise.FrameStack(counts, times, black_level=black, cfa=cfa)
+
+
+LAYOUTS = {
+    "mono": ((4, 4), (64, 96), "mono"),
+    "one exposure": ((9,), (64, 64), "GBRG"),
+    "one exposure, two frames": ((2,), (66, 70), "RGGB"),
+    "single frames": ((1, 1, 1), (64, 64), "BGGR"),
+    "two single frames, mono": ((1, 1), (65, 71), "mono"),
+    "ragged": ((1, 2, 3, 7, 12), (64, 82), "GRBG"),
+    "eight exposures": ((3,) * 8, (64, 64), "RGGB"),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_names_depend_on_the_layout_only(name, rng):
+    frames, shape, cfa = LAYOUTS[name]
+    captures = [
+        (noise(rng, frames, shape, cfa), 64.0),
+        (noise(rng, frames, shape, cfa, mean=-3.0, black=0.0), 0.0),  # clipped: most counts are zero
+        (noise(rng, frames, shape, cfa, mean=6e4, sigma=3e3, black=0.0), 0.0),
+        (noise(rng, frames, shape, cfa, mean=64.0, sigma=0.2), 64.0),  # coarse codes
+    ]
+    found = [structure(stack, np.array(black)) for stack, black in captures]
+    for one in found:
+        assert one.names == found[0].names and one.groups == found[0].groups and one.skipped == found[0].skipped
+        assert len(set(one.names)) == len(one.names) == len(one.groups) == len(one.values) == len(one.error)
+        assert np.isfinite(one.values).all() and np.isfinite(one.error).all() and (one.error > 0).all()
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB", "BGGR", "GRBG", "GBRG"])
+def test_white_noise_is_within_its_errors(cfa, rng):
+    """Normal pixels: log ratios and correlations lie around zero, by about their analytic errors."""
+    found = structure(noise(rng, (8, 8, 8), (96, 128), cfa), np.array(64.0))
+    some = [i for i, n in enumerate(found.names) if any(w in n for w in ("correlation", "away", " / ", "coherence"))]
+    z = found.values[some] / found.error[some]
+    assert len(z) > 50 and np.abs(z).max() < 5.5
+    assert np.sqrt(np.mean(z**2)) < 1.6
+
+
+def test_flats_are_left_alone_and_darks_sorted(rng):
+    one = noise(rng, (4, 3, 5), (64, 64), "RGGB", exposure_s=[0.3, 0.1, 0.2])
+    sorted_ = one.select(exposures=[1, 2, 0])
+    flat = hsnoise.FrameStack(one.counts[0] + 500, [0.1], black_level=64.0, cfa="RGGB", kind="flat")
+    expected = structure(sorted_, np.full(3, 64.0))
+    for stack in (one, hsnoise.FrameStack.join(flat, one)):
+        found = structure(stack, np.full(3, 64.0))
+        assert found.names == expected.names
+        np.testing.assert_array_equal(found.values, expected.values)
+
+
+def test_no_dark_exposure_is_refused(rng):
+    flat = hsnoise.FrameStack(noise(rng, (2,), (64, 64)).counts, [0.1], kind="flat")
+    with pytest.raises(ValueError, match="dark exposure"):
+        structure(flat, np.array(64.0))
+
+
+def test_large_captures_are_cut_and_say_so(rng, monkeypatch):
+    stack = noise(rng, (9, 9), (96, 160), "RGGB")
+    monkeypatch.setattr(_anova, "MOST_FRAME_PIXELS", 64 * 96)
+    monkeypatch.setattr(_anova, "MOST_PIXELS", 6 * 64 * 96)
+    layout = _anova.layout_of(stack)
+    rows, columns = layout.rows, layout.columns
+    assert (rows.stop - rows.start) * (columns.stop - columns.start) <= 64 * 96
+    assert all(n % 4 == 0 for n in (rows.start, rows.stop, columns.start, columns.stop))
+    said = " ".join(structure(stack, np.full(3, 64.0)).skipped)
+    assert "columns" in said and "frames" in said
+
+
+def test_colours_and_levels_are_those_of_the_planes(rng):
+    """A Bayer capture whose colours differ gives each colour its own mean, in every order."""
+    level = {"R": 80.0, "G": 90.0, "B": 120.0}
+    for cfa in ("RGGB", "BGGR", "GRBG", "GBRG"):
+        tile = np.array([level[letter] for letter in cfa]).reshape(2, 2)
+        counts = np.rint(rng.normal(np.tile(tile, (32, 32)), 2.0, (3, 64, 64))).astype(np.uint16)
+        found = structure(hsnoise.FrameStack(counts, [0.1], cfa=cfa), np.array([60.0, 64.0, 70.0]))
+        values = dict(zip(found.names, found.values, strict=True))
+        got = [values[f"level: mean above black, DN, {c}, all"] for c in "RGB"]
+        np.testing.assert_allclose(got, [20.0, 26.0, 50.0], atol=0.15)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_clean_draws_have_no_correlations(camera):
+    names, mean, spread = clean(camera)
+    words = ("correlation of exposures", "correlation, same", "columns away", "coherence")
+    some = [i for i, name in enumerate(names) if any(word in name for word in words)]
+    # Row gains weigh rows: what a sum of zero takes from correlations is then known to a few thousandths only.
+    z = np.abs(mean[some]) / (4.5 * spread[some] / np.sqrt(CLEAN) + 0.004)
+    assert len(z) > 40
+    assert z.max() < 1, names[some[int(np.argmax(z))]]
+
+
+# Effect, the statistic that must react, and its direction.
+REACTIONS = [
+    (SharedRowGain(0.3, 1.0), "row x frame: correlation, same row of G-R, high", 1),
+    (RowNoise(1.5), "row x frame: correlation, same row of G-R, low", 1),
+    (ColumnNoise(1.0), "column x frame: correlation, same column, low", 1),
+    (RowFixedPattern(1.0), "static rows: correlation of exposures, profile, low-low", 1),
+    (ColumnFixedPattern(0.6), "static columns: correlation of exposures, profile, low-high", 1),
+    (FrameOffset(0.6), "frames over time: frame mean / pixel, low", 1),
+    (DarkSignalNonuniformity(1.5), "static pixels: correlation of exposures, map, low-low", 1),
+    (HotPixels(0.005, 2000.0), "static pixels: pixels of the map above 7 sigma, high", 1),
+    (AmplifierGlow(40.0, 0.3), "blocks: static map, mixed low-order shape, high", 1),
+    (RandomTelegraphNoise(0.05, 12.0, 0.4), "pixels over time: correlation of exposures, variance, low-low", 1),
+    (HeavyTailedReadNoise(4.0), "tails: log kurtosis, G, low", 1),
+    (ReadNoiseNonuniformity(0.4), "pixels over time: correlation of exposures, log variance, low-low", 1),
+    (PeriodicBanding(1.5, 0.13), "row spectrum: peak of the spectrum, low", 1),
+    (Crosstalk(0.04), "spatial lags: residual, 1 rows 0 columns away, high", 1),
+    (ReadoutBandwidth(0.06), "spatial lags: residual, 0 rows 1 columns away, low", 1),
+    (ImageLag(0.1), "pixels over time: residual, next frame, high", 1),
+    (OddEvenPattern(1.0), "static columns: parity, low", 1),
+    (TapOffsets(1.0, taps=4), "static columns: steps of 8, low", 1),
+    (MissingCodes(1.7), "codes: roughness of the histogram, high", 1),
+    (CosmicRays(1500.0, 500.0), "pixels over time: pixels with 1 outliers", 1),
+    (BlackClamp([70.0, 60.0, 65.0]), "level: mean above black, DN, G, high", -1),
+]
+
+
+@pytest.mark.parametrize(("effect", "name", "sign"), REACTIONS, ids=[effect.name for effect, *_ in REACTIONS])
+def test_statistic_reacts_to_its_effect(effect, name, sign):
+    names, mean, spread = clean("grasshopper3")
+    found = draw("grasshopper3", effect, seed=100)
+    i = names.index(name)
+    assert found.names == names
+    assert sign * (found.values[i] - mean[i]) > 5 * spread[i]
+
+
+def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():
+    names, mean, spread = clean("grasshopper3")
+    lags = ("0 rows 1 columns", "1 rows 0 columns")
+    along, across = (names.index(f"spatial lags: residual, {lag} away, high") for lag in lags)
+    for effect, both in ((Crosstalk(0.04), True), (ReadoutBandwidth(0.06), False)):
+        z = (draw("grasshopper3", effect, seed=100).values - mean) / spread
+        assert z[along] > 5
+        assert (z[across] > 5) == both
+
+
+def test_row_gain_of_all_colours_grows_with_signal_and_row_noise_does_not():
+    names, mean, spread = clean("grasshopper3")
+    low, high = (names.index(f"row x frame: correlation, same row of G-R, {half}") for half in ("low", "high"))
+    noise_, gain = (draw("grasshopper3", e, seed=100).values - mean for e in (RowNoise(1.5), SharedRowGain(0.3)))
+    assert noise_[low] > noise_[high] + 5 * spread[high]
+    assert gain[high] > gain[low] + 5 * spread[high]
+
+
+@pytest.mark.benchmark
+def test_a_small_capture_takes_a_moment(rng):
+    stack = noise(rng, (8,) * 4, (160, 240), "RGGB")
+    structure(stack, np.full(3, 64.0))
+    start = time.process_time()
+    structure(stack, np.full(3, 64.0))
+    assert time.process_time() - start < 0.15
