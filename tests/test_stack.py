@@ -245,7 +245,7 @@ ARGUMENTS = {
     "row_axis": ({"row_axis": 2}, "row_axis: expected one of 0, 1"),
     "negative black": ({"black_level": -1}, "black_level: expected finite"),
     "NaN black": ({"black_level": np.nan}, "black_level: expected finite"),
-    "blacks": ({"black_level": [1, 2]}, r"black_level: expected 1 \(one a channel\)"),
+    "blacks": ({"black_level": [1, 2]}, r"black_level: expected 1 \(one for each channel\)"),
     "black over white": ({"black_level": 300, "white_level": 200}, "black_level must lie below white_level"),
     "black at white": ({"black_level": 200, "white_level": 200}, "black_level must lie below white_level"),
     "white": ({"white_level": 0}, "white_level: expected a number > 0"),

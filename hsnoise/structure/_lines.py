@@ -105,11 +105,7 @@ def scales(sheet: Sheet, x: Exposure) -> None:
 
 
 def _haar(profile: np.ndarray) -> list[np.ndarray]:
-<<<<<<< HEAD
-    """Mean square of steps between blocks of 1, 2, 4 ... lines of a profile [..., n]; 1 for a white one."""
-=======
     """Mean squares of steps between neighbouring blocks of 1, 2, 4 ... lines of a profile [..., n]; alike if white."""
->>>>>>> structure
     n = profile.shape[-1]
     total = np.zeros((*profile.shape[:-1], n + 1))
     np.cumsum(profile, -1, out=total[..., 1:])

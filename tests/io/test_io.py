@@ -210,7 +210,7 @@ def test_png(tmp_path):
     np.testing.assert_array_equal(read_all(stack), counts[::2])
     with pytest.raises(ValueError, match=r"frame9.png: no exposure time .*give exposure_s="):
         load(tmp_path)
-    with pytest.raises(ValueError, match="exposure_s: expected 3 .one a file or exposure."):
+    with pytest.raises(ValueError, match="exposure_s: expected 3 .one for each file or exposure."):
         load(tmp_path, exposure_s=[1, 2])
 
 
