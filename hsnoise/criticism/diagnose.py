@@ -29,7 +29,9 @@ from hsnoise.structure import structure
 
 DRAWS = 64
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
-MISFIT, MISFIT_LEFT = 4.5, 3.5  # normal scores of the worst group: before, and after the winner
+MISFIT = 4.5  # normal score of the worst group from which something is there
+# What the winner may leave of it: fingerprints of strong effects are known to some percent only.
+MISFIT_LEFT, SHARE_LEFT = 3.5, 0.08
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
@@ -178,7 +180,7 @@ def _verdict(ranking: tuple[Candidate, ...], z: np.ndarray, null: Gaussian, base
     names: tuple[str, ...] = ()
     if not there and max(scores.values()) <= MISFIT:
         verdict = "nothing missing"
-    elif not there or first.misfit > MISFIT_LEFT:
+    elif not there or first.misfit > max(MISFIT_LEFT, SHARE_LEFT * max(scores.values())):
         verdict = "unexplained"
     elif first.name in ALIKE or (second is not None and first.score - second.score < AMBIGUOUS):
         names = (first.name, ALIKE[first.name][0] if first.name in ALIKE else second.name)
