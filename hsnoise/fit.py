@@ -110,7 +110,8 @@ def _check_model(model: NoiseModel) -> bool:
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
         raise ValueError(f"model: fit needs the effects {', '.join(missing)}")
-    physics_of(model)  # raises for effects without a likelihood
+    with jax.enable_x64(True):
+        physics_of(model)  # raises for effects without a likelihood
     return "row_gain" in model
 
 

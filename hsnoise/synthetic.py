@@ -87,20 +87,26 @@ class Problem:
 
     @cached_property
     def coordinates(self) -> Coordinates:
-        physics = replace(self.base.physics, outliers=None)
-        return coordinates_for(self.base.summary, physics)
+        with jax.enable_x64(True):
+            return coordinates_for(self.base.summary, replace(self.base.physics, outliers=None))
 
     @cached_property
     def centre(self) -> np.ndarray:
-        return np.asarray(self.coordinates.vector(self.coordinates.base))
+        with jax.enable_x64(True):
+            return np.asarray(self.coordinates.vector(self.coordinates.base))
 
     @cached_property
     def whiten(self) -> np.ndarray:
         """Square root of the covariance of the base coordinates, directions without information cut to 1."""
-        slope = np.maximum(np.abs(np.asarray(self.coordinates.slope(jnp.asarray(self.centre)))), 1e-12)
+        slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12)
         covariance = self.base.covariance / slope[:, None] / slope[None, :]
         values, vectors = np.linalg.eigh(covariance)
         return vectors * np.sqrt(np.clip(values, 1e-16, 1.0))
+
+    def slope(self, vector: np.ndarray) -> np.ndarray:
+        """d parameter / d coordinate of the base."""
+        with jax.enable_x64(True):
+            return np.asarray(self.coordinates.slope(jnp.asarray(vector)))
 
     @cached_property
     def coding(self):
@@ -108,7 +114,9 @@ class Problem:
 
     @cached_property
     def rules(self):
-        return plan_rules(self.base.physics, summarise(self.darks, coding=self.coding), MARGIN)
+        physics = replace(self.base.physics, outliers=None)
+        with jax.enable_x64(True):
+            return plan_rules(physics, summarise(self.darks, coding=self.coding), MARGIN)
 
     @property
     def start(self) -> np.ndarray:
@@ -120,7 +128,9 @@ class Problem:
 
     def physics(self, y: np.ndarray) -> Physics:
         n = len(self.centre)
-        return self.coordinates.physics(jnp.asarray(self.centre + self.whiten @ y[:n]))
+        with jax.enable_x64(True):
+            physics = self.coordinates.physics(jnp.asarray(self.centre + self.whiten @ y[:n]))
+        return jax.tree.map(np.asarray, physics)
 
     def at(self, y: np.ndarray) -> NoiseModel:
         """The model whose numbers are y."""
@@ -156,6 +166,11 @@ class Problem:
 
     def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics(draw_capture(self.seed + number, self.at(y), self.darks))
+
+
+def _in_float64(problem: Problem, y: np.ndarray) -> NoiseModel:
+    with jax.enable_x64(True):
+        return problem.at(y)
 
 
 def _with(effect: AbstractEffect, field: str, value) -> AbstractEffect:
@@ -196,20 +211,31 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     n, base = len(problem.centre), problem.base
     coordinate = problem.centre + problem.whiten @ y[:n]
     turn = np.zeros((len(y), len(y)))
-    turn[:n, :n] = np.asarray(problem.coordinates.slope(jnp.asarray(coordinate)))[:, None] * problem.whiten
+    turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
     turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
     return replace(
         base,
-        params=problem.at(y),
-        physics=jax.tree.map(np.asarray, problem.physics(y)),
+        params=_in_float64(problem, y),
+        physics=problem.physics(y),
         names=(*base.names, *(knob.label for knob in problem.knobs)),
-        covariance=turn @ covariance @ turn.T,
+        covariance=_not_surer_than(base.covariance, turn @ covariance @ turn.T),
         method="synthetic",
         outcome=f"simulated statistics met: the last step was {last_step:.1g} standard errors long",
         iterations=ITERATIONS,
         log_likelihood=float("nan"),
         notes=_notes(problem, y, covariance),
     )
+
+
+def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """`covariance`, widened where it claims to know base parameters better than the likelihood did without the effects.
+
+    Weights from a few dozen draws fit those draws too well; the effects' own errors are widened by as much.
+    """
+    n = len(base)
+    growth = np.sqrt(np.maximum(np.diagonal(base) / np.diagonal(covariance)[:n], 1.0))
+    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(growth))])
+    return covariance * factor[:, None] * factor[None, :]
 
 
 def _notes(problem: Problem, y: np.ndarray, covariance: np.ndarray) -> tuple[str, ...]:
