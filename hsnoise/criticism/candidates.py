@@ -110,7 +110,9 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
         return fx.AmplifierGlow(peak / s.longest_s, rng.uniform(0.15, 0.5), row, column)
 
     def hot(f: float, rng: np.random.Generator) -> AbstractEffect:
-        return fx.HotPixels(min(0.003 * f, 0.2), rng.uniform(5, 40) * s.read_noise / s.longest_s)
+        return fx.HotPixels(
+            min(0.003 * f, 0.2), np.exp(rng.uniform(np.log(4), np.log(120))) * s.read_noise / s.longest_s
+        )
 
     def cosmic(f: float, rng: np.random.Generator) -> AbstractEffect:
         return fx.CosmicRays(40.0 * f / s.longest_s, rng.uniform(15, 80) * s.read_noise)

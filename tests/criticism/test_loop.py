@@ -47,8 +47,8 @@ def few_candidates(monkeypatch):
 
 
 def test_own_samples_have_error_one():
-    errors = [hsnoise.compare(MODEL, capture(seed=900 + i), draws=24).error for i in range(6)]
-    assert 0.6 < np.median(errors) < 1.6
+    errors = [hsnoise.compare(MODEL, capture(seed=900 + i), draws=24).error for i in range(4)]
+    assert 0.5 < np.median(errors) < 1.8
     assert max(errors) < 4
 
 
@@ -85,7 +85,7 @@ def test_likelihood_per_pixel_prefers_the_truth():
     [
         (fx.RowNoise(1.0), "row_noise"),
         (fx.DarkSignalNonuniformity(1.2), "dark_signal_nonuniformity"),
-        (fx.HotPixels(0.006, 800.0), "hot_pixels"),
+        (fx.HotPixels(0.004, 300.0), "hot_pixels"),
     ],
     ids=["row_noise", "dsnu", "hot"],
 )
