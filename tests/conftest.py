@@ -17,6 +17,13 @@ hypothesis.settings.register_profile("hsnoise", derandomize=True, deadline=None,
 hypothesis.settings.load_profile("hsnoise")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_compiled_programs():
+    """Thousands of compiled programs would use up the memory maps that a process may have (65530 on Linux)."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def key():
     return jax.random.key(2019)
