@@ -24,6 +24,7 @@ CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many 
 FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
 MANY_ROWS, PILOT_ROWS = 30_000, 3_000
 CHORDS, PIECE_MARGIN = 12, 1.1
+CHORD_CLOSE_SIGMA = 0.1  # with the curvature of a part of the frames
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
 REFINEMENTS = 4  # of the curvature
 IDLE_BELOW = -3.0  # softplus coordinate: less than 5 % of what the data resolve
@@ -71,7 +72,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     whiten = whiten / np.sqrt(scale)
     vector, value, distance, more = _chords(vector, whiten, whole)
     iterations = pilot.iterations + steps + more
-    return _ended(coordinates, vector, whiten, information, value, iterations, distance)
+    return _ended(coordinates, vector, whiten, information, value, iterations, distance, CHORD_CLOSE_SIGMA)
 
 
 def _n_rows(summary: Summary) -> int:
@@ -143,9 +144,8 @@ def _chords(vector, whiten, gradients):
     while True:
         (value,), (gradient,) = gradients(vector[None])
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
-        ahead = distance < best[2]
-        best = (vector, float(value), distance) if ahead else best
-        if distance < CLOSE_SIGMA or not ahead or steps == CHORDS:
+        best = (vector, float(value), distance) if distance < best[2] else best
+        if distance < CLOSE_SIGMA or distance > 2 * best[2] or steps == CHORDS:
             return *best, steps
         steps += 1
         vector = vector + whiten @ (whiten.T @ gradient)
@@ -290,7 +290,7 @@ def _is_positive(matrix: np.ndarray, places: list[int]) -> bool:
     return bool(np.linalg.eigvalsh(part / scale[:, None] / scale[None, :]).min() > 1e-9)
 
 
-def _ended(coordinates, vector, whiten, information, value, iterations, distance) -> Maximum:
+def _ended(coordinates, vector, whiten, information, value, iterations, distance, close_sigma=CLOSE_SIGMA) -> Maximum:
     physics, values, _, log_prior = jax.tree.map(np.asarray, _parameters(coordinates, vector))
     return Maximum(
         physics=physics,
@@ -298,7 +298,7 @@ def _ended(coordinates, vector, whiten, information, value, iterations, distance
         information=information,
         log_likelihood=value - float(log_prior),
         iterations=iterations,
-        converged=bool(distance < CLOSE_SIGMA),
+        converged=bool(distance < close_sigma),
         outcome=f"the next Newton step is {distance:.1g} standard errors long" if np.isfinite(distance) else "diverged",
         vector=np.asarray(vector),
         whiten=whiten,

@@ -95,6 +95,7 @@ def test_cameras_and_black_levels(camera, black, black_level):
     assert_recovered(hsnoise.fit(capture(model, black_level=black_level)), model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("exposures", "frames"), [(8, 2), (2, 12)])
 def test_numbers_of_exposures_and_frames(exposures, frames):
     model = hsnoise.cameras.grasshopper3(black_level_dn=64)
