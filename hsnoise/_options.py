@@ -43,6 +43,7 @@ def _demo_arguments(commands: Any) -> None:
         "--data", nargs="+", metavar="PATH", help="fit these dark frames instead: a folder, files or a pattern"
     )
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
+    _method_argument(demo)
     _capture_arguments(demo)
 
 
@@ -52,8 +53,9 @@ def _fit_arguments(commands: Any) -> None:
         "best at several exposures. Writes model.json, table.csv and figures to a folder."
     )
     fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
-    fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or pattern")
+    fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
+    _method_argument(fit)
     _capture_arguments(fit)
 
 
@@ -76,6 +78,8 @@ def _loop_arguments(commands: Any) -> None:
         "nothing significant is left. Writes model.json, table.csv, story.txt and a figure to a folder.",
     )
     for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):
+        if name == "diagnose":
+            _method_argument(parser)
         if name != "improve":
             parser.add_argument(
                 "--model",
@@ -91,13 +95,16 @@ def _loop_arguments(commands: Any) -> None:
         _capture_arguments(parser)
 
 
-def _capture_arguments(parser: argparse.ArgumentParser) -> None:
+def _method_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=("auto", "ml", "line"),
         default="auto",
         help="ml: maximum likelihood; line: the paper's line fit; auto (default): ml, or else line",
     )
+
+
+def _capture_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("what the files do not say", "each overrides what the files say")
     group.add_argument("--exposure", type=_numbers, metavar="S[,S...]", help="exposure in seconds, one or one per file")
     group.add_argument("--kind", choices=("dark", "flat"), help="what the frames are, if not dark")

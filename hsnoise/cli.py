@@ -129,33 +129,33 @@ def _fit_and_report(
 def _compare(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     model, stack = _model(args.model), _load(args.paths, args)
+    args.out.mkdir(parents=True, exist_ok=True)
     with _busy("Drawing from the model"):
         found = hsnoise.compare(model, stack, seed=args.seed)
-    print(found)
-    _write_figure(args.out, "comparison", found)
+    _show(found, args.out / "comparison.png")
 
 
 def _diagnose(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     stack = _load(args.paths, args)
+    args.out.mkdir(parents=True, exist_ok=True)
     fitted = _fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
     with _busy("Drawing every effect that may be missing"):
         found = hsnoise.diagnose(fitted, stack, seed=args.seed)
-    print(found)
-    _write_figure(args.out, "ranking", found)
+    _show(found, args.out / "ranking.png")
 
 
 def _improve(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     stack = _load(args.paths, args)
+    args.out.mkdir(parents=True, exist_ok=True)
     with _busy("Fitting the paper's model") as say:
         story = hsnoise.improve(stack, seed=args.seed, progress=say)
-    print(story)
+    _show(story, args.out / "story.png")
     print(story.fit)
-    _write_figure(args.out, "story", story)
     written = _write_results(story.fit, args.out, {"files": args.paths, "errors": list(story.errors)}, figures=False)
     write_atomically(args.out / "story.txt", f"{story}\n".encode())
-    print(f"Written to {args.out}/: {', '.join(written)}, story.txt, story.png")
+    print(f"Written to {args.out}/: {', '.join(written)}, story.txt")
 
 
 def _sample(args: argparse.Namespace) -> None:
@@ -234,11 +234,17 @@ def _busy(text: str) -> Iterator[Callable[[str], None]]:
         yield lambda sentence: progress.update(task, description=sentence)
 
 
-def _write_figure(out: Path, name: str, found) -> None:
-    out.mkdir(parents=True, exist_ok=True)
+def _show(found, path: Path) -> None:
+    """Print a finding and draw its figure."""
+    print(found)
+    _write_figure(path, found.plot())
+    print(f"Drawn in {path}")
+
+
+def _write_figure(path: Path, figure) -> None:
     buffer = io.BytesIO()
-    found.plot().savefig(buffer, format="png")
-    write_atomically(out / f"{name}.png", buffer.getvalue())
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())
 
 
 def _model(name: str) -> NoiseModel:
@@ -347,9 +353,7 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
         if fit.physics.row_sigma is not None:
             drawings["row_spectrum.png"] = plots.row_spectrum
     for name, draw in drawings.items():
-        buffer = io.BytesIO()
-        draw(fit).savefig(buffer, format="png")
-        write_atomically(out / name, buffer.getvalue())
+        _write_figure(out / name, draw(fit))
     return ["model.json", "table.csv", *drawings]
 
 

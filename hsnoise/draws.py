@@ -16,6 +16,7 @@ from hsnoise.stack import FrameStack
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
 
 
 def darks_of(stack: FrameStack) -> FrameStack:
@@ -26,7 +27,6 @@ def darks_of(stack: FrameStack) -> FrameStack:
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
     if not darks:
         raise ValueError("stack: expected dark frames, got flats only")
-    frames = sum(stack.n_frames[i] for i in darks)
     rows, columns = stack.shape
     per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(darks) * rows * columns))
     frames = sum(min(stack.n_frames[i], per_exposure) for i in darks)
@@ -72,6 +72,11 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
 def _like(stack: FrameStack) -> dict[str, Any]:
     keep = ("exposure_s", "white_level", "cfa", "shutter")
     return {name: getattr(stack, name) for name in keep}
+
+
+def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
+    """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`."""
+    return (dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS)
 
 
 def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:

@@ -101,6 +101,15 @@ class NoiseModel(eqx.Module):
         gone = self[name]
         return self._with(effect for effect in self.effects if effect is not gone)
 
+    def with_value(self, name: str, field: str, value: ArrayLike) -> NoiseModel:
+        """The model with another value of one parameter, such as `model.with_value("gain", "value", 2.0)`.
+
+        Raises KeyError for an effect that it has not, ValueError for a value that does not fit the channels.
+        """
+        old = self[name]
+        new = eqx.tree_at(attrgetter(field), old, jnp.asarray(value, float))
+        return self._with(new if effect is old else effect for effect in self.effects)
+
     def _with(self, effects: Iterable[AbstractEffect]) -> NoiseModel:
         return NoiseModel(effects, cfa=self.cfa, shutter=self.shutter, exposure_s=self.exposure_s)
 

@@ -30,23 +30,24 @@ def profile_errors(coordinates: Coordinates, maximum: Maximum, summary: Summary)
     if sigma < WEAK or not maximum.converged:
         return np.zeros(len(pin))
     across = np.linalg.svd(along[None])[2][1:].T  # whitened directions that leave the gain where it is
-    sides = [_side(coordinates, maximum, summary, maximum.whiten @ along / sigma * s, across) for s in (-1, 1)]
+    rules = plan_rules(maximum.physics, summary)
+    top, _ = gradient_at(coordinates, jnp.asarray(maximum.vector), without_counts(summary), rules)
+    direction = maximum.whiten @ along / sigma
+    sides = [_side(coordinates, maximum, summary, rules, float(top), sign * direction, across) for sign in (-1, 1)]
     return np.max(sides, axis=0)
 
 
-def _side(coordinates, maximum: Maximum, summary: Summary, direction, across) -> np.ndarray:
+def _side(coordinates, maximum: Maximum, summary: Summary, rules, top: float, direction, across) -> np.ndarray:
     light = without_counts(summary)
-    rules = plan_rules(maximum.physics, summary)
     shift, step = FIRST_SIGMA, np.abs(direction[0])
-    top, _ = gradient_at(coordinates, jnp.asarray(maximum.vector), light, rules)
     for _ in range(STEPS):
         shift = min(shift, FARTHEST / step)
         vector = maximum.vector + shift * direction
         rules = replan(rules, plan_rules(coordinates.physics(vector), summary))
         reach = coordinates.reach(vector)
-        vector, _ = quasi_newton(coordinates, vector, maximum.whiten @ across, reach, float(top), light, rules)
+        vector, _ = quasi_newton(coordinates, vector, maximum.whiten @ across, reach, top, light, rules)
         value, _ = gradient_at(coordinates, vector, light, rules)
-        z = np.sqrt(2 * max(float(top - value), 0.0))
+        z = np.sqrt(2 * max(top - float(value), 0.0))
         if z > ENOUGH_SIGMA or shift * step >= FARTHEST:
             break
         shift *= float(np.clip(2 / max(z, LEAST_Z), 1.2, 3.0))

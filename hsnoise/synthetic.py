@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import Coordinates, coordinates_for
-from hsnoise.draws import black_level_of, darks_of, draw_capture, in_threads
-from hsnoise.effects import AbstractEffect
+from hsnoise.draws import black_level_of, darks_of, draw_capture, floored_variance, in_threads
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics
@@ -34,7 +32,6 @@ STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of a
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 LONGEST_STEP = 1.5
 SHRINKAGE = 0.1
-FLOOR_DRAWS = 6.0
 MARGIN = 1.15
 
 
@@ -88,7 +85,7 @@ class Problem:
     @cached_property
     def coordinates(self) -> Coordinates:
         with jax.enable_x64(True):
-            return coordinates_for(self.base.summary, replace(self.base.physics, outliers=None))
+            return coordinates_for(self.base.summary, self.centre_physics)
 
     @cached_property
     def centre(self) -> np.ndarray:
@@ -113,10 +110,13 @@ class Problem:
         return coding_of(self.darks)
 
     @cached_property
+    def centre_physics(self) -> Physics:
+        """The base fit, without shares of outliers: its likelihood gives the score."""
+        return jax.tree.map(np.asarray, replace(self.base.physics, outliers=None))
+
+    @cached_property
     def rules(self):
-        physics = replace(self.base.physics, outliers=None)
-        with jax.enable_x64(True):
-            return plan_rules(physics, summarise(self.darks, coding=self.coding), MARGIN)
+        return plan_rules(self.centre_physics, summarise(self.darks, coding=self.coding), MARGIN)
 
     @property
     def start(self) -> np.ndarray:
@@ -143,23 +143,21 @@ class Problem:
             ("row_gain", "exponent"): physics.exponent,
             ("black_level", "value"): physics.black_level,
         }
-        effects = {effect.name: effect for effect in model}
         for (name, field), value in values.items():
-            if name in effects and value is not None:
-                effects[name] = _with(effects[name], field, value)
+            if name in model and value is not None:
+                model = model.with_value(name, field, value)
         for knob, x in zip(self.knobs, y[len(self.centre) :], strict=True):
-            moved = np.array(getattr(effects[knob.effect], knob.field), float)
+            moved = np.array(getattr(model[knob.effect], knob.field), float)
             moved[knob.index] = knob.inverse(x)
-            effects[knob.effect] = _with(effects[knob.effect], knob.field, moved)
-        return NoiseModel(effects.values(), cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
+            model = model.with_value(knob.effect, knob.field, moved)
+        return model
 
     def statistics(self, darks: FrameStack) -> tuple[np.ndarray, np.ndarray]:
         """Score in whitened units and structure, one after the other, and a rough error of each."""
         found = structure(darks, black_level_of(self.base.params))
         summary = summarise(darks, coding=self.coding)
         with jax.enable_x64(True):
-            physics = jax.tree.map(np.asarray, replace(self.base.physics, outliers=None))
-            rules = replan(self.rules, plan_rules(physics, summary, MARGIN))
+            rules = replan(self.rules, plan_rules(self.centre_physics, summary, MARGIN))
             _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
             score = self.whiten.T @ np.asarray(gradient)
         return np.concatenate([score, found.values]), np.concatenate([np.full(len(score), 0.3), found.error])
@@ -171,10 +169,6 @@ class Problem:
 def _in_float64(problem: Problem, y: np.ndarray) -> NoiseModel:
     with jax.enable_x64(True):
         return problem.at(y)
-
-
-def _with(effect: AbstractEffect, field: str, value) -> AbstractEffect:
-    return eqx.tree_at(lambda e: getattr(e, field), effect, jnp.asarray(value))
 
 
 def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed: int = 0, progress=None) -> FitResult:
@@ -199,12 +193,8 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
         step = np.linalg.solve(information, slopes.T @ weight @ residual - prior * (y - problem.start))
         longest = np.abs(step[n:]).max(initial=0.0)
         y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
-    return _result(
-        problem,
-        y,
-        np.linalg.inv(information),
-        float(np.abs(step / np.sqrt(np.diagonal(np.linalg.inv(information)))).max()),
-    )
+    covariance = np.linalg.inv(information)
+    return _result(problem, y, covariance, float(np.abs(step / np.sqrt(np.diagonal(covariance))).max()))
 
 
 def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float) -> FitResult:
@@ -223,7 +213,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         outcome=f"simulated statistics met: the last step was {last_step:.1g} standard errors long",
         iterations=ITERATIONS,
         log_likelihood=float("nan"),
-        notes=_notes(problem, y, covariance),
+        notes=_notes(problem, covariance),
     )
 
 
@@ -238,7 +228,7 @@ def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return covariance * factor[:, None] * factor[None, :]
 
 
-def _notes(problem: Problem, y: np.ndarray, covariance: np.ndarray) -> tuple[str, ...]:
+def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:
     deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
     loose = [
         f"{knob.label} is not determined by this capture: its value is close to where the search started."
@@ -257,7 +247,7 @@ def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndar
     drawn = in_threads(lambda i: problem.draw(y, i), range(COVARIANCE_DRAWS), tick)
     values, floor = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0)
     n = len(values)
-    variance = ((n - 1) * values.var(0, ddof=1) + FLOOR_DRAWS * floor**2) / (n - 1 + FLOOR_DRAWS)
+    variance = floored_variance(values.var(0, ddof=1), n - 1, floor**2)
     scale = np.sqrt(variance * (1 + 1 / MEAN_DRAWS))
     z = (values - values.mean(0)) / np.sqrt(variance)
     correlation = z.T @ z / (n - 1)

@@ -14,7 +14,7 @@ import hsnoise
 from hsnoise import _options, _output, cli
 from hsnoise.cli import main
 
-COMMANDS = ("demo", "fit", "sample")
+COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample")
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,15 @@ def fitted(capture) -> Path:
     out = capture / "result"
     assert main(["fit", str(capture / "darks.npz"), "--out", str(out), "--shutter", "global", "--debug"]) == 0
     return out
+
+
+def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_path, capsys):
+    arguments = [str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "loop")]
+    assert main(["compare", *arguments, "--model", str(fitted / "model.json"), "--debug"]) == 0
+    assert "1.0: like the model's own samples" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "loop").iterdir()] == ["comparison.png"]
+    assert main(["compare", *arguments, "--model", "canon_5d3"]) == 2
+    assert "params" in capsys.readouterr().err
 
 
 def test_fit_writes_a_model_a_table_and_figures(fitted):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -132,10 +131,6 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
     return makers
 
 
-def seeded(maker: Maker, seed: int) -> Callable[[float], AbstractEffect]:
-    """The maker with its details fixed by a seed."""
-    return partial(_with_seed, maker, seed)
-
-
-def _with_seed(maker: Maker, seed: int, amplitude: float) -> AbstractEffect:
-    return maker(amplitude, np.random.default_rng(seed))
+def made(maker: Maker, amplitude: float, detail: int) -> AbstractEffect:
+    """The effect at an amplitude, with details number `detail`."""
+    return maker(amplitude, np.random.default_rng(detail))

@@ -9,12 +9,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise.criticism.reference import misfits, reference
-from hsnoise.draws import black_level_of, check_fits, darks_of
+from hsnoise.criticism.reference import measure, misfits, reference
+from hsnoise.draws import check_fits, darks_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.stack import as_stack
-from hsnoise.structure import structure
 
 DRAWS = 40
 WORST = 5  # statistics told in words
@@ -83,7 +82,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
     darks = darks_of(stack)
-    measured = structure(darks, black_level_of(params))
+    measured = measure(darks, params)
     own = reference(params, darks, draws, seed, progress or (lambda: None))
     z = own.z(measured.values)
     groups = misfits(z, own.groups)

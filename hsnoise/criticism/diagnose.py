@@ -16,16 +16,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise.criticism.candidates import Maker, built_in, given
+from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.fingerprint import GRID, Fingerprint, base_slopes, fingerprint
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.reference import Reference, reference
-from hsnoise.draws import black_level_of, check_fits, darks_of
+from hsnoise.criticism.reference import Reference, measure, reference
+from hsnoise.draws import check_fits, darks_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
-from hsnoise.structure import structure
 
 DRAWS = 64
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
@@ -115,7 +114,7 @@ def diagnose(
         stack: FrameStack, or a bare array with FrameStack's keywords; its dark frames are used.
         candidates: effects of your own, ready-made instances, that take part beside the built-in ones.
         draws: captures drawn from the fitted model; seed: of all draws.
-        progress: called with no argument after each captures that is drawn.
+        progress: called with no argument after each capture that is drawn.
 
     Raises:
         TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, or is in the model.
@@ -130,11 +129,11 @@ def diagnose(
     darks = darks_of(stack)
     makers = built_in(model, darks) | own
     base = reference(model, darks, draws, seed, tick)
-    z = base.z(structure(darks, black_level_of(model)).values)
+    z = base.z(measure(darks, model).values)
     slopes = base_slopes(model, darks, base, seed, tick)
     null = shrunk(base.own_z(), slopes)
     prints = [fingerprint(name, maker, model, darks, base, seed, tick) for name, maker in makers.items()]
-    ranking = _ranking(prints, makers, z, null, base, seed)
+    ranking = _ranking(prints, z, null, base)
     return _verdict(ranking, z, null, base)
 
 
@@ -149,9 +148,7 @@ def _own(candidates: Any, model) -> dict[str, Maker]:
     return makers
 
 
-def _ranking(
-    prints: list[Fingerprint], makers: dict[str, Maker], z: np.ndarray, null: Gaussian, base: Reference, seed: int
-) -> tuple[Candidate, ...]:
+def _ranking(prints: list[Fingerprint], z: np.ndarray, null: Gaussian, base: Reference) -> tuple[Candidate, ...]:
     """Candidates by their log-likelihood ratio at their best amplitude."""
     nothing = null.log_density(z)
     found = []
@@ -163,7 +160,7 @@ def _ranking(
         found.append(
             Candidate(
                 name=of.name,
-                effect=of.effect(int(np.argmax(closest)), float(GRID[i])),
+                effect=made(of.maker, float(GRID[i]), int(np.argmax(closest))),
                 score=float(scores[i]),
                 # A likelihood ratio exceeds c by chance at most once in exp(c) (Markov), in any of the candidates.
                 p_value=float(min(1.0, len(prints) * np.exp(-max(scores[i], 0.0)))),

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.criticism.candidates import Maker, seeded
+from hsnoise.criticism.candidates import Maker, made
 from hsnoise.criticism.gaussian import Gaussian
-from hsnoise.criticism.reference import Reference
-from hsnoise.draws import black_level_of, draw_capture, in_threads
-from hsnoise.effects import AbstractEffect
+from hsnoise.criticism.reference import Reference, measure
+from hsnoise.draws import draw_capture, in_threads
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
-from hsnoise.structure import structure
 
 AMPLITUDES = (0.35, 1.0, 2.5)
 DETAILS = 4  # draws at each amplitude, each with other details
@@ -32,7 +27,7 @@ class Fingerprint:
     """Shifts of the statistics [amplitude, detail, statistic] in units of the base draws' deviation."""
 
     name: str
-    effect: Callable[[int, float], AbstractEffect]
+    maker: Maker
     shifts: np.ndarray
 
     def law(self, amplitude: float, null: Gaussian) -> Gaussian:
@@ -56,32 +51,23 @@ def fingerprint(
     name: str, maker: Maker, model: NoiseModel, darks: FrameStack, base: Reference, seed: int, tick
 ) -> Fingerprint:
     """Draw a candidate on top of the model; the draws share their random numbers with those of `base`."""
-    black = black_level_of(model)
-
-    def shift(task: tuple[float, int]) -> np.ndarray:
-        amplitude, detail = task
-        effect = seeded(maker, detail)(amplitude)
-        values = structure(draw_capture(seed + detail, model.add(effect), darks), black).values
-        return (values - base.draws[detail]) / base.deviation
-
-    tasks = [(amplitude, detail) for amplitude in AMPLITUDES for detail in range(DETAILS)]
-    shifts = np.stack(in_threads(shift, tasks, tick)).reshape(len(AMPLITUDES), DETAILS, -1)
-    return Fingerprint(name, lambda detail, amplitude: seeded(maker, detail)(amplitude), shifts)
+    tasks = [(made(maker, amplitude, detail), detail) for amplitude in AMPLITUDES for detail in range(DETAILS)]
+    shifts = in_threads(lambda task: _shift(model.add(task[0]), task[1], model, darks, base, seed), tasks, tick)
+    return Fingerprint(name, maker, np.stack(shifts).reshape(len(AMPLITUDES), DETAILS, -1))
 
 
 def base_slopes(model: NoiseModel, darks: FrameStack, base: Reference, seed: int, tick) -> np.ndarray:
     """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
-    black = black_level_of(model)
     moved = _moved_models(model)
+    tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
+    shifts = in_threads(lambda task: _shift(task[0], task[1], model, darks, base, seed), tasks, tick)
+    return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
 
-    def shift(task: tuple[int, int]) -> np.ndarray:
-        which, draw = task
-        values = structure(draw_capture(seed + draw, moved[which], darks), black).values
-        return (values - base.draws[draw]) / base.deviation
 
-    tasks = [(which, draw) for which in range(len(moved)) for draw in range(SLOPE_DRAWS)]
-    shifts = np.stack(in_threads(shift, tasks, tick)).reshape(len(moved), SLOPE_DRAWS, -1)
-    return REACH * shifts.mean(1)
+def _shift(changed: NoiseModel, number: int, model: NoiseModel, darks: FrameStack, base: Reference, seed: int):
+    """Statistics of draw `number` of a changed model less those of `model`, of the same random numbers."""
+    values = measure(draw_capture(seed + number, changed, darks), model).values
+    return (values - base.draws[number]) / base.deviation
 
 
 def _moved_models(model: NoiseModel) -> list[NoiseModel]:
@@ -97,12 +83,7 @@ def _moved_models(model: NoiseModel) -> list[NoiseModel]:
         for i in np.ndindex(value.shape):
             changed = value.copy()
             changed[i] += steps[i]
-            models.append(_with(model, name, field, changed))
+            models.append(model.with_value(name, field, changed))
     if "row_gain" in model and model.shutter == "rolling":
-        models.append(_with(model, "row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05))
+        models.append(model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05))
     return models
-
-
-def _with(model: NoiseModel, name: str, field: str, value: np.ndarray) -> NoiseModel:
-    changed = eqx.tree_at(lambda effect: getattr(effect, field), model[name], jnp.asarray(value))
-    return model.remove(name).add(changed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,12 @@ from rich.table import Table
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import Diagnosis, diagnose
 from hsnoise.criticism.gaussian import shrunk
-from hsnoise.criticism.reference import reference
-from hsnoise.draws import black_level_of, darks_of
+from hsnoise.criticism.reference import measure, reference
+from hsnoise.draws import darks_of
 from hsnoise.fit import fit
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack, as_stack
-from hsnoise.structure import structure
 
 MOST_STEPS = 4
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
@@ -130,7 +129,7 @@ def improve(
         say("Looking for what is missing")
         own = [c for c in candidates if c.name not in last.fit.params]
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)
-        steps[-1] = last = Step(last.fit, last.comparison, found, last.added, last.held_out, last.moved)
+        steps[-1] = last = replace(last, diagnosis=found)
         if found.best is None:
             return Story(tuple(steps), _end(found, last.comparison))
         say(f"Adding {found.best.name}")
@@ -163,7 +162,7 @@ def _step(result, fitted, held_out, added, before: Step | None, seed: int, say) 
 def _held_out(model: NoiseModel, frames: FrameStack, seed: int) -> float:
     """Gaussian synthetic log-likelihood of the statistics of frames that no fit has seen."""
     own = reference(model, frames, HELD_OUT_DRAWS, seed + 5000)
-    values = structure(frames, black_level_of(model)).values
+    values = measure(frames, model).values
     law = shrunk(own.own_z(), np.zeros((1, len(values))))
     return float(law.log_density(own.z(values)) - np.log(own.deviation).sum())
 

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hsnoise.draws import black_level_of, draw_capture, in_threads
+from hsnoise.draws import black_level_of, draw_capture, floored_variance, in_threads
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 from hsnoise.structure import Structure, structure
-
-FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
 
 
 @dataclass(frozen=True)
@@ -23,6 +21,7 @@ class Reference:
         draws [draw, statistic]: the statistics of the draws.
         mean, deviation [statistic]: over the draws; the deviation is kept from vanishing by an analytic error, so
             that no statistic explodes because the draws hardly vary.
+        floor [statistic]: that analytic error, squared.
     """
 
     names: tuple[str, ...]
@@ -30,6 +29,7 @@ class Reference:
     draws: np.ndarray
     mean: np.ndarray
     deviation: np.ndarray
+    floor: np.ndarray
 
     def z(self, values: np.ndarray) -> np.ndarray:
         """(values - mean) / deviation, the error of the mean included."""
@@ -41,16 +41,8 @@ class Reference:
         others = (self.draws.sum(0) - self.draws) / (n - 1)
         squares = (self.draws**2).sum(0) - self.draws**2
         variance = np.maximum(squares - (n - 1) * others**2, 0) / (n - 2)
-        floor = _floored(self.deviation**2, self.draws) * np.ones_like(variance)
-        weight = n - 2
-        deviation = np.sqrt((weight * variance + FLOOR_DRAWS * floor) / (weight + FLOOR_DRAWS))
+        deviation = np.sqrt(floored_variance(variance, n - 2, self.floor))
         return (self.draws - others) / (deviation * np.sqrt(1 + 1 / (n - 1)))
-
-
-def _floored(total: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """The analytic variance that went into `total`, given the draws."""
-    n = len(draws)
-    return np.maximum((total * (n - 1 + FLOOR_DRAWS) - (n - 1) * draws.var(0, ddof=1)) / FLOOR_DRAWS, 1e-30)
 
 
 def measure(stack: FrameStack, model: NoiseModel) -> Structure:
@@ -60,13 +52,11 @@ def measure(stack: FrameStack, model: NoiseModel) -> Structure:
 
 def reference(model: NoiseModel, like: FrameStack, draws: int, seed: int, tick=lambda: None) -> Reference:
     """Statistics of `draws` captures drawn from `model` as `like` was taken."""
-    black = black_level_of(model)
-    drawn = in_threads(lambda i: structure(draw_capture(seed + i, model, like), black), range(draws), tick)
+    drawn = in_threads(lambda i: measure(draw_capture(seed + i, model, like), model), range(draws), tick)
     values = np.stack([one.values for one in drawn])
-    n = len(values)
     floor = np.median([one.error for one in drawn], axis=0) ** 2
-    variance = ((n - 1) * values.var(0, ddof=1) + FLOOR_DRAWS * floor) / (n - 1 + FLOOR_DRAWS)
-    return Reference(drawn[0].names, drawn[0].groups, values, values.mean(0), np.sqrt(variance))
+    variance = floored_variance(values.var(0, ddof=1), draws - 1, floor)
+    return Reference(drawn[0].names, drawn[0].groups, values, values.mean(0), np.sqrt(variance), floor)
 
 
 def misfits(z: np.ndarray, groups: tuple[str, ...]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""About 200 statistics of dark frames, each variance-stabilised: where a capture and a model's draws are compared.
+"""About 300 statistics of dark frames, each variance-stabilised: where a capture and a model's draws are compared.
 
 Marginal histograms do not tell row noise from white noise of the same variance; these statistics do. They are log
 ratios of variances, artanh of correlations and square roots of rare numbers, so that their spread hardly depends on
