@@ -29,7 +29,7 @@ class Coordinates(eqx.Module):
     """Maps the free fields of a Physics to a vector and back; each number depends on one coordinate only.
 
     Gain, read noise and outliers are logarithms; dark current and row gain, which may be zero, are softplus of their
-    value over a scale that the data resolve; exponent and black level are themselves.
+    value over a scale that the data resolve; exponent, black level and clamp are themselves.
     """
 
     base: Physics
@@ -53,7 +53,7 @@ class Coordinates(eqx.Module):
         """How far each coordinate may go from `vector` before the rows' quadrature has to be planned anew."""
         names = np.repeat(self.free, [np.size(getattr(self.base, name)) for name in self.free])
         doubled = 5.0 + np.maximum(np.asarray(vector), 0.0)
-        fixed = {"black_level": np.inf, "dark_current": np.inf}
+        fixed = {"black_level": np.inf, "black_clamp": np.inf, "dark_current": np.inf}
         return np.where(np.isin(names, ["row_sigma"]), doubled, [fixed.get(name, 2.0) for name in names])
 
     def slope(self, vector) -> jax.Array:
@@ -117,6 +117,8 @@ def coordinates_for(summary: Summary, start: Physics) -> Coordinates:
             free.append("exponent")
     if summary.black_level_dn is None and summary.histograms:
         free.append("black_level")
+    if start.black_clamp is not None:
+        free.append("black_clamp")
     if start.outliers is not None:
         free.append("outliers")
     pixels = sum(float(h.counts[..., :].sum(dtype=np.float64)) for h in summary.histograms) + 1.0
@@ -150,6 +152,7 @@ def labels(coordinates: Coordinates, channels: tuple[str, ...]) -> tuple[str, ..
     """Table names of the free parameters, in the order of `vector`."""
     named = {"gain": "gain", "read_noise": "read_noise.sigma", "dark_current": "dark_current.rate"}
     named |= {"row_sigma": "row_gain.sigma", "exponent": "row_gain.exponent", "black_level": "black_level"}
+    named |= {"black_clamp": "black_clamp.rate"}
     out = []
     for name in coordinates.free:
         if name == "outliers":

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from hsnoise._keys import named_key
-from hsnoise.model import NoiseModel, sample_dark
+from hsnoise.model import NoiseModel, sample_dark_by_effect
 from hsnoise.stack import FrameStack
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
@@ -64,7 +64,9 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
         own = jax.random.fold_in(named_key(key, "frames"), e)
-        drawn = sample_dark(own, frames, like.shape, model, exposure_s=float(exposure_s), sensor_key=sensor_key)
+        drawn = sample_dark_by_effect(
+            own, frames, like.shape, model, exposure_s=float(exposure_s), sensor_key=sensor_key
+        )
         counts.append(np.asarray(drawn))
     return FrameStack(counts, **_like(like))
 

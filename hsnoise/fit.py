@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import coordinates_for, labels
-from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.line import line_fit
 from hsnoise.maximise import maximise
 from hsnoise.model import NoiseModel
@@ -24,7 +24,7 @@ from hsnoise.synthetic import fit_synthetic
 OUTLIERS_FROM = 1e-4
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
-BASE_NAMES = tuple(effect.name for effect in BASE_EFFECTS)
+WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
 
 
 def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progress=None, **keywords) -> FitResult:
@@ -54,7 +54,7 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     if model is not None and not isinstance(model, NoiseModel):
         raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
-    extra = () if model is None else tuple(name for name in model.names if name not in BASE_NAMES)
+    extra = () if model is None else tuple(name for name in model.names if name not in WITH_LIKELIHOOD)
     if extra:
         return _with_effects(stack, model, extra, method, progress, keywords)
     with_row_gain = model is None or _check_model(model)
@@ -63,12 +63,15 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         raise ValueError(
             f"model: made for {model.cfa}, {model.shutter} shutter; the stack is {summary.cfa}, {summary.shutter}"
         )
+    with_clamp = model is not None and "black_clamp" in model
+    if with_clamp:
+        _check_clamp(summary, method)
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
             "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
         )
     with jax.enable_x64(True):
-        start = start_physics(summary, with_row_gain)
+        start = start_physics(summary, with_row_gain, with_clamp)
         if model is not None and "dark_current" not in model:
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
         if method == "line":
@@ -83,7 +86,7 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
             result, converged = _by_likelihood(summary, model, start)
         if converged:
             return result
-        if method == "ml":
+        if method == "ml" or with_clamp:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {result.outcome}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({result.outcome}); the line fit instead")
 
@@ -113,6 +116,13 @@ def _check_model(model: NoiseModel) -> bool:
     with jax.enable_x64(True):
         physics_of(model)  # raises for effects without a likelihood
     return "row_gain" in model
+
+
+def _check_clamp(summary: Summary, method: str) -> None:
+    if method == "line":
+        raise ValueError("method: the line fit takes the means for the dark signal, which black_clamp hides; use ml")
+    if not summary.histograms or np.ptp(summary.exposure_s) == 0:
+        raise ValueError("model: black_clamp shows in darks of two or more exposures only, which this stack has not")
 
 
 def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, bool]:
@@ -175,6 +185,7 @@ def _model_with(physics: Physics, summary: Summary, model: NoiseModel | None) ->
         "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent),
         "gain": lambda: Gain(physics.gain),
         "black_level": lambda: BlackLevel(physics.black_level),
+        "black_clamp": lambda: BlackClamp(jnp.maximum(physics.black_clamp, 0.0)),
         "shot_noise": ShotNoise,
         "adc": lambda: ADC(summary.white_level_dn),
     }

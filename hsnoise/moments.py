@@ -8,6 +8,8 @@ from scipy.stats import norm
 from hsnoise.physics import Physics
 from hsnoise.statistics import RowHistograms, Summary
 
+CLAMPED_E = 6.0
+
 
 def unclip(mean, variance):
     """Mean and variance before clipping at 0 of a normal variable with these moments after it (any shape)."""
@@ -21,23 +23,26 @@ def unclip(mean, variance):
     return np.where(far, mean, position * sigma), np.where(far, variance, sigma**2)
 
 
-def start_physics(summary: Summary, with_row_gain: bool = True) -> Physics:
-    """Moment estimates: the photon transfer line of the exposures and the spread of row means."""
+def start_physics(summary: Summary, with_row_gain: bool = True, with_clamp: bool = False) -> Physics:
+    """Moment estimates: the photon transfer line of the exposures and the spread of row means.
+
+    with_clamp: the camera subtracts part of the dark signal, so that the means do not tell it.
+    """
     if not summary.histograms:
         return _start_of_flats(summary, with_row_gain)
-    estimates = [_channel_moments(summary, h) for h in summary.histograms]
-    black = np.array([b for _, _, _, b in estimates])
-    gain = np.array([_slope(signal, variance) for signal, variance, _, _ in estimates])
-    electrons = [np.maximum(signal, 0.0) / k for (signal, _, _, _), k in zip(estimates, gain, strict=True)]
+    estimates = [_channel_moments(summary, h, with_clamp) for h in summary.histograms]
+    black = np.array([b for _, _, _, b, _ in estimates])
+    gain = np.array([_slope(signal, variance) for signal, variance, *_ in estimates])
+    electrons = [np.maximum(signal, 0.0) / k for (signal, *_), k in zip(estimates, gain, strict=True)]
     t = summary.exposure_s
     rate = np.mean([(e * t).sum() / max((t * t).sum(), 1e-300) for e in electrons]) if t.any() else 0.0
     read = np.mean(
         [
             np.median(np.maximum(variance / k**2 - e, 0.02 * variance / k**2))
-            for (_, variance, _, _), k, e in zip(estimates, gain, electrons, strict=True)
+            for (_, variance, *_), k, e in zip(estimates, gain, electrons, strict=True)
         ]
     )
-    sigma = np.array([spread for _, _, spread, _ in estimates])
+    sigma = np.array([spread for _, _, spread, *_ in estimates])
     return Physics(
         gain=gain,
         dark_current=np.asarray(max(float(rate), 1e-9)),
@@ -45,6 +50,7 @@ def start_physics(summary: Summary, with_row_gain: bool = True) -> Physics:
         row_sigma=sigma if with_row_gain else None,
         exponent=np.asarray(0.0 if summary.shutter == "global" else 0.8),
         black_level=black,
+        black_clamp=np.array([clamp for *_, clamp in estimates]) if with_clamp else None,
     )
 
 
@@ -82,8 +88,8 @@ def binned_moments(histograms: RowHistograms):
     return pixels, mean, (second - n * mean**2) / (n - 1)
 
 
-def _channel_moments(summary: Summary, histograms: RowHistograms):
-    """Signal and variance [exposure] in DN, spread of the row gain, black level of one channel."""
+def _channel_moments(summary: Summary, histograms: RowHistograms, with_clamp: bool):
+    """Signal and variance [exposure] in DN, spread of the row gain, black level DN and clamp DN/s of one channel."""
     c = summary.channels.index(histograms.channel)
     pixels, row_mean, row_variance = binned_moments(histograms)
     used = pixels > 2
@@ -93,11 +99,20 @@ def _channel_moments(summary: Summary, histograms: RowHistograms):
     variance = np.array([np.median(v[u]) for v, u in zip(row_variance, used, strict=True)])
     variance = np.maximum(variance - 1 / 12, 1e-3)
     black = _black_start(summary, c, level, variance)
-    signal = level - black
+    clamp = _clamp_start(summary.exposure_s, level, variance) if with_clamp else 0.0
+    signal = level - black + clamp * summary.exposure_s
     spread = np.array([row_mean[e][used[e]].var() for e in range(len(level))]) - variance / n.max((1, 2))
     relative = np.maximum(spread, 0.0) / np.maximum(signal**2, variance)
     sigma = np.sqrt(np.clip(relative[np.argmax(signal)], 1e-4, 1.0))
-    return signal, variance, sigma, black
+    return signal, variance, sigma, black, clamp
+
+
+def _clamp_start(exposure_s, level, variance) -> float:
+    """The clamp at which the longest exposure holds CLAMPED_E electrons: the variance tells gain^2 times rate only."""
+    growth, drift = (max(float(np.polyfit(exposure_s, y, 1)[0]), 0.0) for y in (variance, level))
+    longest = exposure_s.max()
+    gain = np.sqrt(growth * longest / CLAMPED_E)
+    return max(gain * CLAMPED_E / longest - drift, 0.0)
 
 
 def _black_start(summary: Summary, c: int, level, variance) -> float:

@@ -30,6 +30,7 @@ class Physics(eqx.Module):
 
     outliers [exposure]: fraction of pixels that follow no such law (hot pixels, cosmic hits) and may hold any count;
     None for none. It keeps them from bending the estimates of all the others.
+    black_clamp [channel]: DN that the camera subtracts for each second of exposure; None for none.
     """
 
     gain: jax.Array
@@ -39,6 +40,7 @@ class Physics(eqx.Module):
     exponent: jax.Array
     black_level: jax.Array
     outliers: jax.Array | None = None
+    black_clamp: jax.Array | None = None
 
 
 class Block(eqx.Module):
@@ -70,7 +72,7 @@ Rules = tuple[RowRule, ...]
 
 def physics_of(model: NoiseModel) -> Physics:
     """The base parameters of a model in float64. Raises ValueError for effects without a likelihood."""
-    known = {"shot_noise", "dark_current", "read_noise", "gain", "row_gain", "black_level", "adc"}
+    known = {"shot_noise", "dark_current", "read_noise", "gain", "row_gain", "black_level", "black_clamp", "adc"}
     extra = [effect.name for effect in model.effects if effect.name not in known]
     if extra:
         raise ValueError(f"log_likelihood: effects {extra} do not state how they change the likelihood")
@@ -87,6 +89,7 @@ def physics_of(model: NoiseModel) -> Physics:
         row_sigma=None if row_gain is None else f64(row_gain.sigma),
         exponent=f64(0.0) if row_gain is None else f64(row_gain.exponent),
         black_level=f64(model["black_level"].value) if "black_level" in model else jnp.zeros(n, jnp.float64),
+        black_clamp=f64(model["black_clamp"].rate) if "black_clamp" in model else None,
     )
 
 
@@ -178,13 +181,21 @@ def _sum_with_gradient(function, physics: Physics, inputs):
 def log_probability(physics: Physics, at: Binning, beta):
     """log P(bin | beta) of one part: [node, bin] for beta [node]."""
     scale = physics.gain[at.channel] * jnp.maximum(beta, 1e-6)
-    edges_e = (at.edges_dn - physics.black_level[at.channel])[None, :] / scale[:, None]
+    black = black_level_at(physics, at.exposure_s)[at.channel]
+    edges_e = (at.edges_dn - black)[None, :] / scale[:, None]
     mean_e = physics.dark_current * at.exposure_s
     table = jnp.log(bin_probability(*distribution(0, edges_e, mean_e, physics.read_noise, at.law)) + FLOOR)
     if physics.outliers is None:
         return table
     share = physics.outliers[at.exposure]
     return jnp.logaddexp(table + jnp.log1p(-share), jnp.log(share * at.outlier_law + FLOOR)[None, :])
+
+
+def black_level_at(physics: Physics, exposure_s):
+    """Where the counts of pixels without electrons lie, DN [..., channel], from exposure_s [..., 1] or a scalar."""
+    if physics.black_clamp is None:
+        return physics.black_level
+    return physics.black_level - physics.black_clamp * exposure_s
 
 
 def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
@@ -194,7 +205,7 @@ def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
     where the photons are known the mean itself counts (EMVA 1288 release 4, section 6).
     """
     flats = summary.flats
-    gain, black = physics.gain[None, :], physics.black_level[None, :]
+    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s[:, None])
     row_variance = jnp.zeros_like(gain) if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
     signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
     variance = flat_variance(physics, flats)
@@ -213,7 +224,7 @@ def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
 
 def flat_variance(physics: Physics, flats: FlatMoments):
     """Expected temporal variance within rows [level, channel], DN^2: the photon transfer line."""
-    gain, black = physics.gain[None, :], physics.black_level[None, :]
+    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s[:, None])
     row_variance = 0.0 if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
     signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
     return (gain * signal + (gain * physics.read_noise) ** 2) * (1 + row_variance) + ROUNDING_VARIANCE

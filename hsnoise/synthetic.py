@@ -142,6 +142,7 @@ class Problem:
             ("row_gain", "sigma"): physics.row_sigma,
             ("row_gain", "exponent"): physics.exponent,
             ("black_level", "value"): physics.black_level,
+            ("black_clamp", "rate"): None if physics.black_clamp is None else np.maximum(physics.black_clamp, 0),
         }
         for (name, field), value in values.items():
             if name in model and value is not None:

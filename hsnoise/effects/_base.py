@@ -27,6 +27,7 @@ import numpy as np
 from jax.scipy.special import gammaincc
 
 from hsnoise._keys import named_key
+from hsnoise._poisson import poisson
 from hsnoise._types import (
     Counts,
     FrameRows,
@@ -236,7 +237,7 @@ def draw_poisson(key: RandomKey, mean: Frames) -> Frames:
 
     Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
     """
-    return jax.random.poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)
+    return poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
 
 def draw_poisson_of_one_mean(key: RandomKey, mean: Scalar, like: Frames) -> Frames:
@@ -251,7 +252,7 @@ def draw_poisson_of_one_mean(key: RandomKey, mean: Scalar, like: Frames) -> Fram
         )
 
     def directly(key):
-        return jax.random.poisson(key, mean, like.shape).astype(like.dtype)
+        return poisson(key, jnp.broadcast_to(mean, like.shape)).astype(like.dtype)
 
     return jax.lax.cond(mean < POISSON_TABLE_UP_TO, from_table, directly, key)
 
