@@ -14,7 +14,8 @@ EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 
 
 def capture(model, seed=3, frames=4, shape=(96, 128)):
-    counts = [np.full((frames, *shape), 70, np.uint16) for _ in EXPOSURE_S]
+    rng = np.random.default_rng(0)
+    counts = [rng.integers(60, 80, (frames, *shape)).astype(np.uint16) for _ in EXPOSURE_S]
     like = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=64, cfa=model.cfa, shutter=model.shutter)
     drawn = draw_capture(seed, model, like)
     return hsnoise.FrameStack(drawn.counts, EXPOSURE_S, black_level=64, cfa=model.cfa, shutter=model.shutter)

@@ -9,6 +9,7 @@ systems", Nature 466, 2010), and a verdict is given only if the winner also expl
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +17,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise.criticism.candidates import Maker, built_in, given, made
-from hsnoise.criticism.fingerprint import GRID, Fingerprint, base_slopes, fingerprint
-from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.criticism.candidates import Maker, built_in, given
+from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
+from hsnoise.criticism.fingerprint import Bench
+from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
 from hsnoise.criticism.reference import Reference, measure, reference
 from hsnoise.draws import check_fits, darks_of
 from hsnoise.effects import AbstractEffect
@@ -27,6 +30,8 @@ from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
 
 DRAWS = 64
+AMPLITUDES, DETAILS = (0.35, 1.0, 2.5), 4  # draws at each amplitude, each with other details
+CLOSE_DETAILS = 6
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
@@ -35,24 +40,6 @@ AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """An effect that may be missing.
-
-    Attributes:
-        name: of the effect; effect: ready to add, with a first estimate of its parameters.
-        score: log-likelihood ratio against "nothing missing", nats.
-        p_value: chance of such a score if nothing is missing, over the whole ranking.
-        misfit: normal score of the group of statistics that fits worst with this effect in the model.
-    """
-
-    name: str
-    effect: AbstractEffect
-    score: float
-    p_value: float
-    misfit: float
 
 
 @dataclass(frozen=True)
@@ -69,10 +56,10 @@ class Diagnosis:
     """What `diagnose` found.
 
     Attributes:
-        ranking: candidates, best first.
+        ranking: candidates, best first; two that explain the capture only together come before all others.
         verdict: "nothing missing", "named", "ambiguous" or "unexplained".
         best: the first candidate if the verdict is "named" or "ambiguous", else None.
-        names: those that the verdict names (several if it is "ambiguous").
+        names: those that the verdict names: two if it is "ambiguous", or if two effects are missing together.
         advice: the capture that would decide, or what to look at next.
         unexplained: what remains.
     """
@@ -128,13 +115,38 @@ def diagnose(
     own = _own(candidates, model)
     darks = darks_of(stack)
     makers = built_in(model, darks) | own
-    base = reference(model, darks, draws, seed, tick)
-    z = base.z(measure(darks, model).values)
-    slopes = base_slopes(model, darks, base, seed, tick)
-    null = shrunk(base.own_z(), slopes)
-    prints = [fingerprint(name, maker, model, darks, base, seed, tick) for name, maker in makers.items()]
-    ranking = _ranking(prints, z, null, base)
-    return _verdict(ranking, z, null, base)
+    bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
+    null = shrunk(bench.base.own_z(), bench.slopes())
+    evidence = Evidence(bench.base.z(measure(darks, model).values), null, bench.base.groups, len(makers))
+    prints = [bench.fingerprint(name, maker, AMPLITUDES, DETAILS) for name, maker in makers.items()]
+    judged = _best_first(judge(of, evidence) for of in prints)
+    pair = None
+    if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
+        judged = _closer(judged, bench, evidence)
+        if judged[0].misfit > MISFIT_LEFT:
+            pair = best_pair(judged, evidence)
+    ranking = [one.candidate(evidence) for one in judged]
+    found = _verdict(ranking, pair, evidence, bench.base)
+    if found.verdict == "unexplained" or CLAMP in [c.name for c in ranking[:2] if c.score > EVIDENCE]:
+        clamp = clamp_by_likelihood(fit, bench, evidence)
+        if clamp is not None:
+            others = [c for c in ranking if c.name != CLAMP]
+            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence, bench.base)
+    return found
+
+
+def _best_first(judged: Iterable[Judged]) -> list[Judged]:
+    return sorted(judged, key=lambda one: -one.score)
+
+
+def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
+    """The leading candidates drawn again close to their amplitudes: fingerprints bend, and strong effects show it."""
+    drawn = []
+    for one in judged[:LEADERS]:
+        around = tuple(CLOSE[[0, 3, -1]] * one.amplitude)
+        again = bench.fingerprint(one.of.name, one.of.maker, around, CLOSE_DETAILS)
+        drawn.append(judge(again, evidence, CLOSE * one.amplitude))
+    return _best_first([*drawn, *judged[LEADERS:]])
 
 
 def _own(candidates: Any, model) -> dict[str, Maker]:
@@ -148,52 +160,37 @@ def _own(candidates: Any, model) -> dict[str, Maker]:
     return makers
 
 
-def _ranking(prints: list[Fingerprint], z: np.ndarray, null: Gaussian, base: Reference) -> tuple[Candidate, ...]:
-    """Candidates by their log-likelihood ratio at their best amplitude."""
-    nothing = null.log_density(z)
-    found = []
-    for of in prints:
-        laws = [of.law(amplitude, null) for amplitude in GRID]
-        scores = np.array([law.log_density(z) for law in laws]) - nothing
-        i = int(scores.argmax())
-        closest = [Gaussian(shift, laws[i].covariance).log_density(z) for shift in of.at(GRID[i])]
-        found.append(
-            Candidate(
-                name=of.name,
-                effect=made(of.maker, float(GRID[i]), int(np.argmax(closest))),
-                score=float(scores[i]),
-                # A likelihood ratio exceeds c by chance at most once in exp(c) (Markov), in any of the candidates.
-                p_value=float(min(1.0, len(prints) * np.exp(-max(scores[i], 0.0)))),
-                misfit=max(laws[i].normal_scores(z, base.groups).values()),
-            )
-        )
-    return tuple(sorted(found, key=lambda c: -c.score))
-
-
-def _verdict(ranking: tuple[Candidate, ...], z: np.ndarray, null: Gaussian, base: Reference) -> Diagnosis:
-    scores = null.normal_scores(z, base.groups)
+def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, base: Reference) -> Diagnosis:
+    scores = evidence.null.normal_scores(evidence.z, base.groups)
+    worst = max(scores.values())
+    allowed = max(MISFIT_LEFT, SHARE_LEFT * worst)
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
-    there = first.score > EVIDENCE
-    names: tuple[str, ...] = ()
-    if not there and max(scores.values()) <= MISFIT:
+    names: tuple[str, ...] = (first.name,)
+    left = first.misfit
+    if pair is not None and pair.score > first.score + EVIDENCE and pair.misfit < min(left, allowed):
+        left, names = pair.misfit, pair.names
+        ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
+        first = ranking[0]
+    verdict = "named"
+    if first.score <= EVIDENCE and worst <= MISFIT:
         verdict = "nothing missing"
-    elif not there or first.misfit > max(MISFIT_LEFT, SHARE_LEFT * max(scores.values())):
+    elif first.score <= EVIDENCE or left > allowed:
         verdict = "unexplained"
-    elif first.name in ALIKE or (second is not None and first.score - second.score < AMBIGUOUS):
-        names = (first.name, ALIKE[first.name][0] if first.name in ALIKE else second.name)
-        verdict = "ambiguous"
-    else:
-        verdict, names = "named", (first.name,)
+    elif first.name in ALIKE:
+        verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
+    elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
+        verdict, names = "ambiguous", (first.name, second.name)
+    if verdict in ("nothing missing", "unexplained"):
+        left, names = worst, ()
     group = max(scores, key=scores.__getitem__)
-    order = [i for i in np.argsort(-np.abs(z)) if abs(z[i]) > 3][:WORST]
-    left = first.misfit if names else max(scores.values())
+    order = [i for i in np.argsort(-np.abs(evidence.z)) if abs(evidence.z[i]) > 3][:WORST]
     return Diagnosis(
-        ranking=ranking,
+        ranking=tuple(ranking),
         verdict=verdict,
         best=first if names else None,
         names=names,
         advice=_advice(verdict, names, first, group),
-        unexplained=Unexplained(left, group, tuple(f"{base.names[i]} (z = {z[i]:+.1f})" for i in order)),
+        unexplained=Unexplained(left, group, tuple(f"{base.names[i]} (z = {evidence.z[i]:+.1f})" for i in order)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,6 @@ from hsnoise.draws import draw_capture, in_threads
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
-AMPLITUDES = (0.35, 1.0, 2.5)
-DETAILS = 4  # draws at each amplitude, each with other details
-GRID = np.geomspace(0.15, 5.0, 18)
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
 SLOPE_DRAWS = 3
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off
@@ -28,6 +26,7 @@ class Fingerprint:
 
     name: str
     maker: Maker
+    amplitudes: tuple[float, ...]
     shifts: np.ndarray
 
     def law(self, amplitude: float, null: Gaussian) -> Gaussian:
@@ -40,34 +39,40 @@ class Fingerprint:
 
     def at(self, amplitude: float) -> np.ndarray:
         """Shifts [detail, statistic], interpolated between the amplitudes that were drawn, linear from 0."""
-        knots = (0.0, *AMPLITUDES)
+        knots = (0.0, *self.amplitudes)
         values = np.concatenate([np.zeros_like(self.shifts[:1]), self.shifts])
         i = min(int(np.searchsorted(knots, amplitude, side="right")), len(knots) - 1)
         share = (amplitude - knots[i - 1]) / (knots[i] - knots[i - 1])
         return values[i - 1] + share * (values[i] - values[i - 1])
 
 
-def fingerprint(
-    name: str, maker: Maker, model: NoiseModel, darks: FrameStack, base: Reference, seed: int, tick
-) -> Fingerprint:
-    """Draw a candidate on top of the model; the draws share their random numbers with those of `base`."""
-    tasks = [(made(maker, amplitude, detail), detail) for amplitude in AMPLITUDES for detail in range(DETAILS)]
-    shifts = in_threads(lambda task: _shift(model.add(task[0]), task[1], model, darks, base, seed), tasks, tick)
-    return Fingerprint(name, maker, np.stack(shifts).reshape(len(AMPLITUDES), DETAILS, -1))
+@dataclass(frozen=True)
+class Bench:
+    """What every candidate is drawn on: the model, a capture to be like, the draws of the model, where seeds start."""
 
+    model: NoiseModel
+    darks: FrameStack
+    base: Reference
+    seed: int
+    tick: Callable[[], None]
 
-def base_slopes(model: NoiseModel, darks: FrameStack, base: Reference, seed: int, tick) -> np.ndarray:
-    """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
-    moved = _moved_models(model)
-    tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
-    shifts = in_threads(lambda task: _shift(task[0], task[1], model, darks, base, seed), tasks, tick)
-    return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
+    def fingerprint(self, name: str, maker: Maker, amplitudes: tuple[float, ...], details: int) -> Fingerprint:
+        """Draw a candidate on top of the model; the draws share their random numbers with those of the model."""
+        tasks = [(made(maker, amplitude, detail), detail) for amplitude in amplitudes for detail in range(details)]
+        shifts = in_threads(lambda task: self._shift(self.model.add(task[0]), task[1]), tasks, self.tick)
+        return Fingerprint(name, maker, amplitudes, np.stack(shifts).reshape(len(amplitudes), details, -1))
 
+    def slopes(self) -> np.ndarray:
+        """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
+        moved = _moved_models(self.model)
+        tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
+        shifts = in_threads(lambda task: self._shift(*task), tasks, self.tick)
+        return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
 
-def _shift(changed: NoiseModel, number: int, model: NoiseModel, darks: FrameStack, base: Reference, seed: int):
-    """Statistics of draw `number` of a changed model less those of `model`, of the same random numbers."""
-    values = measure(draw_capture(seed + number, changed, darks), model).values
-    return (values - base.draws[number]) / base.deviation
+    def _shift(self, changed: NoiseModel, number: int) -> np.ndarray:
+        """Statistics of draw `number` of a changed model less those of the model, of the same random numbers."""
+        values = measure(draw_capture(self.seed + number, changed, self.darks), self.model).values
+        return (values - self.base.draws[number]) / self.base.deviation
 
 
 def _moved_models(model: NoiseModel) -> list[NoiseModel]:

@@ -1,0 +1,41 @@
+"""The black clamp as a candidate, by the exact likelihood: its statistics are almost those of another gain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.criticism.fingerprint import Bench
+from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.ranking import Candidate, Evidence
+from hsnoise.criticism.reference import measure, reference
+from hsnoise.effects import BlackClamp
+from hsnoise.fit import WITH_LIKELIHOOD, fit
+from hsnoise.result import FitResult
+
+CLAMP = BlackClamp.name
+DRAWS = 40
+
+
+def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> Candidate | None:
+    """The capture refitted with a clamp; None if that is no better, or cannot be done.
+
+    It can be done for a maximum-likelihood fit of darks at several exposures, without other effects in the model.
+    """
+    model = bench.model
+    if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
+        return None
+    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(bench.darks.exposure_s) == 0:
+        return None
+    try:
+        clamped = fit(fitted.summary, model=model.add(BlackClamp(0.0)))
+    except RuntimeError:  # it did not converge: no evidence for a clamp
+        return None
+    parameters = len(clamped.names) - len(fitted.names)
+    score = clamped.log_likelihood - fitted.log_likelihood - parameters
+    if not score > 0 or not np.any(np.asarray(clamped.params[CLAMP].rate)):
+        return None
+    own = reference(clamped.params, bench.darks, DRAWS, bench.seed, bench.tick)
+    law = shrunk(own.own_z(), np.zeros((1, len(own.mean))))
+    z = own.z(measure(bench.darks, clamped.params).values)
+    misfit = max(law.normal_scores(z, own.groups).values())
+    return Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)

@@ -1,0 +1,113 @@
+"""Candidates in order of their log-likelihood ratio, one at a time and two together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hsnoise.criticism.candidates import made
+from hsnoise.criticism.fingerprint import Fingerprint
+from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.effects import AbstractEffect
+
+GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
+CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
+PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
+LEADERS = 3  # candidates that are paired with all others
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing.
+
+    Attributes:
+        name: of the effect; effect: ready to add, with a first estimate of its parameters.
+        score: log-likelihood ratio against "nothing missing", nats.
+        p_value: chance of such a score if nothing is missing, over the whole ranking.
+        misfit: normal score of the group of statistics that fits worst with this effect in the model.
+    """
+
+    name: str
+    effect: AbstractEffect
+    score: float
+    p_value: float
+    misfit: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the candidates are judged by: z [statistic] of the capture, its law if nothing is missing, groups."""
+
+    z: np.ndarray
+    null: Gaussian
+    groups: tuple[str, ...]
+    candidates: int
+
+    def score(self, law: Gaussian) -> float:
+        """Log-likelihood ratio of a law against "nothing missing"."""
+        return float(law.log_density(self.z) - self.null.log_density(self.z))
+
+    def misfit(self, law: Gaussian) -> float:
+        return max(law.normal_scores(self.z, self.groups).values())
+
+    def p_value(self, score: float) -> float:
+        # A likelihood ratio exceeds c by chance at most once in exp(c) (Markov), in any of the candidates.
+        return float(min(1.0, self.candidates * np.exp(-max(score, 0.0))))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A fingerprint at the amplitude that describes the capture best."""
+
+    of: Fingerprint
+    amplitude: float
+    score: float
+    misfit: float
+
+    def candidate(self, evidence: Evidence) -> Candidate:
+        covariance = self.of.law(self.amplitude, evidence.null).covariance
+        closest = [Gaussian(shift, covariance).log_density(evidence.z) for shift in self.of.at(self.amplitude)]
+        effect = made(self.of.maker, self.amplitude, int(np.argmax(closest)))
+        return Candidate(self.of.name, effect, self.score, evidence.p_value(self.score), self.misfit)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two candidates that explain the capture together, the one with more evidence of its own first."""
+
+    names: tuple[str, str]
+    score: float
+    misfit: float
+
+
+def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) -> Judged:
+    """A fingerprint at the best of some amplitudes."""
+    laws = [of.law(float(amplitude), evidence.null) for amplitude in amplitudes]
+    scores = [evidence.score(law) for law in laws]
+    i = int(np.argmax(scores))
+    return Judged(of, float(amplitudes[i]), scores[i], evidence.misfit(laws[i]))
+
+
+def best_pair(judged: list[Judged], evidence: Evidence) -> Pair | None:
+    """The pair that describes the capture best, of the leading candidates with all others; `judged` is best first."""
+    best: tuple[float, tuple[Judged, Judged], Gaussian] | None = None
+    for i, first in enumerate(judged[:LEADERS]):
+        for second in judged[i + 1 :]:
+            for law in _laws_together(first, second, evidence.null):
+                score = evidence.score(law)
+                if best is None or score > best[0]:
+                    best = score, (first, second), law
+    if best is None:
+        return None
+    score, (first, second), law = best
+    return Pair((first.of.name, second.of.name), score, evidence.misfit(law))
+
+
+def _laws_together(first: Judged, second: Judged, null: Gaussian):
+    """Laws with both effects in the sensor: shifts and scatters add."""
+    for a in PAIR_FIRST * first.amplitude:
+        one = first.of.law(float(a), null)
+        for b in PAIR_SECOND:
+            other = second.of.law(float(b), null)
+            yield Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)
