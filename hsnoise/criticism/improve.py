@@ -15,10 +15,12 @@ from hsnoise.criticism.diagnose import Diagnosis, diagnose
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import darks_of
-from hsnoise.fit import fit
+from hsnoise.effects import AbstractEffect
+from hsnoise.fit import WITH_LIKELIHOOD, fit
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack, as_stack
+from hsnoise.synthetic import fit_synthetic
 
 MOST_STEPS = 4
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
@@ -133,7 +135,7 @@ def improve(
         if found.best is None:
             return Story(tuple(steps), _end(found, last.comparison))
         say(f"Adding {found.best.name}")
-        result = fit(fitted, model=last.fit.params.add(found.best.effect))
+        result = _with_one_more(steps, found.best.effect, fitted)
         step = _step(result, fitted, held_out, found.best.name, last, seed, say)
         if step.held_out - last.held_out < WORSE or step.comparison.error > last.comparison.error:
             reason = (
@@ -141,6 +143,14 @@ def improve(
             )
             return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
         steps.append(step)
+
+
+def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack) -> FitResult:
+    model = steps[-1].fit.params.add(effect)
+    if effect.name in WITH_LIKELIHOOD:
+        return fit(fitted, model=model)
+    base = next(step.fit for step in reversed(steps) if step.fit.method != "synthetic")
+    return fit_synthetic(base, fitted, model)
 
 
 def _split(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:

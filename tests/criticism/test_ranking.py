@@ -1,0 +1,55 @@
+"""Candidates are judged by their shifts, alone and two together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise import effects as fx
+from hsnoise.criticism.fingerprint import Fingerprint
+from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.ranking import Evidence, best_pair, judge
+
+STATISTICS, AMPLITUDES = 40, (0.35, 1.0, 2.5)
+GROUPS = tuple("abcd"[i // 10] for i in range(STATISTICS))
+
+
+def fingerprint(name: str, which: slice, size: float = 12.0) -> Fingerprint:
+    """An effect that moves some statistics in proportion to its amplitude, a little differently in each detail."""
+    shift = np.zeros(STATISTICS)
+    shift[which] = size
+    rng = np.random.default_rng(len(name))
+    details = 1 + 0.03 * rng.standard_normal((3, 4, 1))
+    shifts = np.array(AMPLITUDES)[:, None, None] * shift * details
+    return Fingerprint(name, lambda amplitude, rng: fx.RowNoise(amplitude), AMPLITUDES, shifts)
+
+
+PRINTS = [fingerprint("left", slice(0, 5)), fingerprint("middle", slice(12, 18)), fingerprint("right", slice(30, 38))]
+
+
+def evidence(*hidden: Fingerprint, amplitude: float = 0.8) -> Evidence:
+    noise = np.random.default_rng(5).standard_normal(STATISTICS)
+    z = noise + sum(of.at(amplitude).mean(0) for of in hidden)
+    return Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), GROUPS, len(PRINTS))
+
+
+def test_single_effect_is_first_and_leaves_nothing():
+    found = evidence(PRINTS[1])
+    judged = sorted((judge(of, found) for of in PRINTS), key=lambda one: -one.score)
+    assert judged[0].of.name == "middle" and 0.6 < judged[0].amplitude < 1.1
+    assert judged[0].misfit < 3 < judged[1].misfit
+    candidate = judged[0].candidate(found)
+    assert candidate.p_value < 1e-6 and float(candidate.effect.sigma) == judged[0].amplitude
+
+
+def test_nothing_hidden_gives_no_evidence():
+    scores = [judge(of, evidence()).score for of in PRINTS]
+    assert max(scores) < 3 and evidence().p_value(max(scores)) > 0.05
+
+
+def test_two_effects_are_found_together():
+    found = evidence(PRINTS[0], PRINTS[2])
+    judged = sorted((judge(of, found) for of in PRINTS), key=lambda one: -one.score)
+    assert judged[0].misfit > 4
+    pair = best_pair(judged, found)
+    assert set(pair.names) == {"left", "right"} and pair.misfit < 3 and pair.score > judged[0].score + 10
+    assert best_pair(judged[:1], found) is None
