@@ -1,7 +1,8 @@
 """A simulator of dark captures with a hidden effect, in NumPy; it shares no code with hsnoise.
 
-`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]. Amplitude 1 of an effect is like
-that of a modest real sensor; its details (period, corner, taps) are drawn from `rng`.
+`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]; `effect` may be a pair that acts
+together. Amplitude 1 of an effect is like that of a modest real sensor; its details (period, corner, taps) are drawn
+from `rng`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 
 @dataclass(frozen=True)
 class Camera:
-    """Gain [R, G, B] DN/e-, dark current e-/s, read noise e-, row gain sigma [R, G, B], 1/f rows or white, black DN."""
+    """Gain [channel] DN/e-, dark current e-/s, read noise e-, row gain sigma [channel], 1/f rows or white, black DN.
+
+    Three channels are an RGGB sensor, one is a mono sensor.
+    """
 
     gain: tuple[float, ...]
     dark: float
@@ -27,6 +31,8 @@ class Camera:
 
 CANON = Camera((1.53, 1.23, 1.31), 51.7, 12.5**0.5, (0.197**0.5, 0.039**0.5, 0.013**0.5), True, 0.0)
 GRASSHOPPER = Camera((3.54, 3.11, 3.95), 118.0, 5.43**0.5, (0.09, 0.0069**0.5, 0.026**0.5), False, 64.0)
+MONO = Camera((2.1,), 80.0, 3.0, (0.12,), True, 64.0)
+CAMERAS = {"canon": CANON, "grasshopper": GRASSHOPPER, "mono": MONO}
 
 # Amplitude 1 in each effect's own measure.
 MODEST = {
@@ -51,12 +57,23 @@ MODEST = {
     "missing_codes": 1.6,  # digital gain
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
     "shared_row_gain": 0.12,
+    "black_clamp": 0.7,  # of the dark level
+    "nonlinearity": 0.003,  # curvature, 1/e-
 }
 ODD = ("ramp_37_rows", "block_offsets", "read_noise_along_row", "gain_vignette")
+PAIRS = (
+    ("row_noise", "hot_pixels"),
+    ("column_fixed_pattern", "amplifier_glow"),
+    ("frame_offset", "dark_signal_nonuniformity"),
+    ("crosstalk", "random_telegraph_noise"),
+    ("periodic_banding", "tap_offsets"),
+)
 
 
-def colour_of(shape: tuple[int, int]) -> np.ndarray:
-    """Channel of each pixel of an RGGB sensor, [row, column]."""
+def colour_of(shape: tuple[int, int], channels: int = 3) -> np.ndarray:
+    """Channel of each pixel of an RGGB sensor (of a mono sensor: one channel), [row, column]."""
+    if channels == 1:
+        return np.zeros(shape, int)
     tile = np.array([[0, 1], [1, 2]])
     return np.tile(tile, (shape[0] // 2, shape[1] // 2))
 
@@ -74,15 +91,48 @@ def series(rng, frames: int, n: int, exponent: float) -> np.ndarray:
     return np.fft.irfft(modes * amplitude, n, axis=1) * n / np.sqrt(2 * power)
 
 
-def capture(camera: Camera, effect: str | None, amplitude: float, rng, *, frames=8, shape=(160, 240)) -> np.ndarray:
-    """Counts [exposure, frame, row, column] of an RGGB sensor with `effect` hidden in it (None: nothing)."""
-    size = MODEST.get(effect, 1.0) * amplitude if effect != "heavy_tailed_read_noise" else MODEST[effect] / amplitude
-    hidden = _static(effect, size, camera, rng, shape)
-    return np.stack([_exposure(camera, effect, size, hidden, t, rng, frames, shape) for t in EXPOSURE_S])
+def capture(
+    camera: Camera,
+    effect: str | tuple[str, ...] | None,
+    amplitude: float,
+    rng,
+    *,
+    frames=8,
+    shape=(160, 240),
+    exposure_s=EXPOSURE_S,
+) -> np.ndarray:
+    """Counts [exposure, frame, row, column] with `effect` hidden in them (None: nothing; several: all at once)."""
+    effects = (effect,) if isinstance(effect, str) else effect or ()
+    sizes = {name: _size(name, amplitude) for name in effects}
+    hidden = _static(sizes, camera, rng, shape)
+    return np.stack([_exposure(camera, sizes, hidden, t, rng, frames, shape) for t in exposure_s])
 
 
-def _static(effect: str | None, size: float, camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
-    """What stays the same in all frames of the sensor."""
+def _size(effect: str, amplitude: float) -> float:
+    """An amplitude in the effect's own measure."""
+    if effect not in MODEST and effect not in ODD:
+        raise ValueError(f"effect: {effect!r} is not one of {', '.join((*MODEST, *ODD))}")
+    if effect == "heavy_tailed_read_noise":
+        return max(MODEST[effect] / amplitude, 2.1)  # the variance of Student's t is finite above 2
+    size = MODEST.get(effect, 1.0) * amplitude
+    return min(size, 1.0) if effect == "black_clamp" else size  # no camera subtracts more than the dark level
+
+
+def _static(sizes: dict[str, float], camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
+    """What stays the same in all frames of the sensor, of all effects together."""
+    out: dict[str, np.ndarray | float] = {}
+    for effect, size in sizes.items():
+        for name, value in _static_of(effect, size, camera, rng, shape).items():
+            if name in ("offset", "rate"):
+                value = out.get(name, 0.0) + value
+            elif name in ("read", "gain"):
+                value = out.get(name, 1.0) * value
+            out[name] = value
+    return out
+
+
+def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
+    """What stays the same in all frames of the sensor, of one effect."""
     rows, columns = shape
     r, c = np.mgrid[0:rows, 0:columns]
     out: dict[str, np.ndarray | float] = {}
@@ -93,7 +143,7 @@ def _static(effect: str | None, size: float, camera: Camera, rng, shape) -> dict
     elif effect == "dark_signal_nonuniformity":
         out["offset"] = size * rng.standard_normal(shape)
     elif effect == "odd_even_pattern":
-        out["offset"] = size * ((c // 2) % 2 - 0.5)
+        out["offset"] = size * ((c // (1 if len(camera.gain) == 1 else 2)) % 2 - 0.5)
     elif effect == "tap_offsets":
         taps = int(rng.choice([2, 4, 8]))
         levels = rng.standard_normal(taps)
@@ -124,29 +174,32 @@ def _static(effect: str | None, size: float, camera: Camera, rng, shape) -> dict
     return out
 
 
-def _exposure(camera: Camera, effect, size, hidden, t: float, rng, frames: int, shape) -> np.ndarray:
-    rows, columns = shape
+def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) -> np.ndarray:
     whole = (frames, *shape)
     rate = camera.dark + hidden.get("rate", 0.0)
-    if effect == "dark_current_drift":
-        rate = rate * (1 + size * (np.arange(frames)[:, None, None] / max(frames - 1, 1) - 0.5))
+    if drift := sizes.get("dark_current_drift"):
+        rate = rate * (1 + drift * (np.arange(frames)[:, None, None] / max(frames - 1, 1) - 0.5))
     x = rng.poisson(np.broadcast_to(rate * t, whole)).astype(float)
-    if effect == "cosmic_rays":
-        x += (rng.random(whole) < size * 1e-6) * rng.exponential(120.0, whole)
-    if effect == "crosstalk":
+    if hits := sizes.get("cosmic_rays"):
+        x += (rng.random(whole) < hits * 1e-6) * rng.exponential(120.0, whole)
+    if leak := sizes.get("crosstalk"):
         padded = np.pad(x, ((0, 0), (1, 1), (1, 1)), mode="edge")
         around = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
-        x = (1 - 4 * size) * x + size * around
-    if effect == "image_lag":
-        x[1:] = (1 - size) * x[1:] + size * x[:-1]
+        x = (1 - 4 * leak) * x + leak * around
+    if lag := sizes.get("image_lag"):
+        x[1:] = (1 - lag) * x[1:] + lag * x[:-1]
     noise = rng.standard_normal(whole)
-    if effect == "heavy_tailed_read_noise":
-        noise = rng.standard_t(size, whole) * np.sqrt((size - 2) / size)
+    if freedom := sizes.get("heavy_tailed_read_noise"):
+        noise = rng.standard_t(freedom, whole) * np.sqrt((freedom - 2) / freedom)
     x += camera.read * noise * hidden.get("read", 1.0) + hidden.get("offset", 0.0)
-    x += _moving(effect, size, hidden, rng, frames, shape)
-    if effect == "readout_bandwidth":
-        x[:, :, 1:] = (1 - size) * x[:, :, 1:] + size * x[:, :, :-1]
-    return _digital(camera, effect, size, x * hidden.get("gain", 1.0), rng)
+    for effect, size in sizes.items():
+        x += _moving(effect, size, hidden, rng, frames, shape)
+    if smear := sizes.get("readout_bandwidth"):
+        x[:, :, 1:] = (1 - smear) * x[:, :, 1:] + smear * x[:, :, :-1]
+    if curvature := sizes.get("nonlinearity"):
+        x = np.minimum(x, 0.5 / curvature)  # level beyond its summit
+        x = x - curvature * np.maximum(x, 0) ** 2
+    return _digital(camera, sizes, x * hidden.get("gain", 1.0), t, rng)
 
 
 def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float:
@@ -168,19 +221,21 @@ def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float
     return 0.0
 
 
-def _digital(camera: Camera, effect, size, x: np.ndarray, rng) -> np.ndarray:
+def _digital(camera: Camera, sizes, x: np.ndarray, t: float, rng) -> np.ndarray:
     """Gain, row gain, black level, codes."""
     frames, rows, _ = x.shape
-    colour = colour_of(x.shape[1:])
+    channels = len(camera.gain)
+    colour = colour_of(x.shape[1:], channels)
     shared = np.zeros((frames, rows))
-    if effect == "shared_row_gain":
-        shared = size * series(rng, frames, rows, float(camera.rolling))
+    if sigma := sizes.get("shared_row_gain"):
+        shared = sigma * series(rng, frames, rows, float(camera.rolling))
     y = np.empty_like(x)
-    for c in range(3):
+    for c in range(channels):
         beta = 1 + camera.row_sigma[c] * series(rng, frames, rows, float(camera.rolling))
         beta = np.maximum(beta, 0) * np.maximum(1 + shared, 0)
-        y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x, y)
+        clamped = sizes.get("black_clamp", 0.0) * camera.gain[c] * camera.dark * t
+        y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x - clamped, y)
     counts = np.clip(np.rint(y + camera.black), 0, 65535)
-    if effect == "missing_codes":
-        counts = np.clip(np.rint(np.rint(counts / size) * size), 0, 65535)
+    if step := sizes.get("missing_codes"):
+        counts = np.clip(np.rint(np.rint(counts / step) * step), 0, 65535)
     return counts.astype(np.uint16)
