@@ -13,7 +13,9 @@ from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
-CHANCE = 0.05  # p-value from which a misfit is taken for chance
+CHANCE = 0.05  # p-value from which a misfit is taken for chance,
+CLEAR = 3.0  # unless the error is beyond this: few draws give no small p-value
+ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars
 MOST_CANDIDATES = 10
 TITLES = {Comparison: "Model against measurement", Diagnosis: "What is missing", Story: "How the model was improved"}
@@ -81,7 +83,7 @@ def _verdict_of_story(story: Story) -> str:
 def is_good(found: Comparison | Diagnosis | Story) -> bool:
     """Whether nothing significant is left to find."""
     if isinstance(found, Comparison):
-        return found.p_value > CHANCE
+        return found.p_value > CHANCE and found.error < CLEAR
     if isinstance(found, Story):
         last = found.steps[-1].diagnosis
         return last is not None and last.verdict == "nothing missing"
@@ -124,7 +126,7 @@ def _unit(unit: str) -> str:
 def bars(comparison: Comparison) -> dict[str, Any]:
     """Misfit of each group as a bar on a logarithmic scale, worst first; positions in percent of the width.
 
-    `own`: misfit that the worst group takes on the model's own samples, beyond which a bar is an alarm.
+    `own`: misfit that the worst group takes on the model's own samples.
     """
     groups = sorted(comparison.groups.items(), key=lambda item: -item[1])
     own = groups[0][1] / comparison.error if comparison.error > 0 else 1.0
@@ -133,7 +135,7 @@ def bars(comparison: Comparison) -> dict[str, Any]:
     def at(misfit: float) -> str:
         return f"{100 * max(np.log(max(misfit, LEAST_SHOWN) / LEAST_SHOWN) / span, 0.005):.2f}%"
 
-    shown = [{"name": g, "misfit": number(m), "width": at(m), "alarm": m > own} for g, m in groups]
+    shown = [{"name": g, "misfit": number(m), "width": at(m), "alarm": m > ALARM * own} for g, m in groups]
     return {"groups": shown, "one": at(1.0), "own": at(own), "own_misfit": number(own)}
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 
 from hsnoise import plots
@@ -64,8 +65,8 @@ def frames(at: Shown) -> dict[str, Any]:
     pair = [_measured.crop(one[0]) for one in (at.measured, at.drawn[0])]
     low, high = np.percentile(pair[0], STRETCH)
     high = max(high, low + 1)
-    pictures = [_png(np.clip((one - low) / (high - low), 0, 1)) for one in pair]
-    return {"measured": pictures[0], "drawn": pictures[1], "low": f"{low:g}", "high": f"{high:g}", "size": pair[0].shape}
+    measured, drawn = (_png(np.clip((one - low) / (high - low), 0, 1)) for one in pair)
+    return {"measured": measured, "drawn": drawn, "low": f"{low:g}", "high": f"{high:g}", "size": pair[0].shape}
 
 
 def _png(grey: np.ndarray) -> str:
@@ -102,7 +103,16 @@ def spectrum(at: Shown, channel: str, axis: int) -> Figure:
     axes.fill_between(k, drawn.min(0), drawn.max(0), color="0.6", alpha=0.4, linewidth=0)
     axes.loglog(k, drawn.mean(0), color=FIT, linewidth=1.4, label="model")
     axes.loglog(k, power, "o", color=COLOURS[channel], markersize=4.5, label="measured")
+    for along, values in ((axes.xaxis, k), (axes.yaxis, [*power, *drawn.ravel()])):
+        _few_decades(along, min(values), max(values))
     return _legend(figure, axes)
+
+
+def _few_decades(axis: Axis, low: float, high: float) -> None:
+    """Plain numbers along a logarithmic axis, between the decades too if there are not even two."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _panel(title: str, x: str, y: str) -> tuple[Figure, Axes]:
@@ -130,5 +140,6 @@ def svg(figure: Figure, prefix: str, label: str) -> Markup:
     box = re.search(r'viewBox="([^"]*)"', head).group(1)
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", body, flags=re.DOTALL)
     body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", body)
-    body = body.replace("#000000", "currentColor").replace("#e5e5e5", "var(--grid)").replace("#404040", "var(--mono)")
+    # Black, and the grid's and mono's grey of the plots' style.
+    body = body.replace("#000000", "currentColor").replace("#e6e6e6", "var(--grid)").replace("#404040", "var(--mono)")
     return Markup('<svg viewBox="{}" role="img" aria-label="{}">').format(box, label) + Markup(body)
