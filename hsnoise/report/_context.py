@@ -17,7 +17,7 @@ CHANCE = 0.05  # p-value from which a misfit is taken for chance,
 CLEAR = 3.0  # unless the error is beyond this: few draws give no small p-value
 ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars
-MOST_CANDIDATES = 10
+MOST_CANDIDATES, MOST_FILES = 10, 3
 TITLES = {Comparison: "Model against measurement", Diagnosis: "What is missing", Story: "How the model was improved"}
 
 
@@ -93,12 +93,13 @@ def is_good(found: Comparison | Diagnosis | Story) -> bool:
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
     """Files, size and exposures of a capture."""
     rows, columns = stack.shape
+    more = [f"and {len(files) - MOST_FILES} more"] if len(files) > MOST_FILES else []
     groups = [
         f"{n} {kind}{'s' if n > 1 else ''} of {exposure:g} s"
         for n, kind, exposure in zip(stack.n_frames, stack.kind, stack.exposure_s, strict=True)
     ]
     return {
-        "files": list(files),
+        "files": ", ".join([*files[:MOST_FILES], *more]),
         "frames": f"{rows} x {columns} pixels, {stack.cfa}, {stack.shutter} shutter",
         "groups": groups,
     }

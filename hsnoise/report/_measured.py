@@ -38,16 +38,16 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int) -> Shown:
         TypeError, ValueError: model and stack do not fit together, no darks.
     """
     check_fits(model, stack)
-    darks = darks_of(stack)
+    darks = darks_of(stack).select(frames=slice(0, MOST_FRAMES))
     longest = int(np.argmax(darks.exposure_s))
-    part = darks.select(exposures=[longest], frames=slice(0, MOST_FRAMES))
     seeds = [seed + SEED_APART + i for i in range(DRAWS)]
-    drawn = in_threads(lambda one: _frames(draw_capture(one, model, part)), seeds)
-    return Shown(float(part.exposure_s[0]), part.cfa, part.channels, _frames(part), drawn)
+    # All exposures are drawn, because a stack of a single frame would be refused.
+    drawn = in_threads(lambda one: _frames(draw_capture(one, model, darks), longest), seeds)
+    return Shown(float(darks.exposure_s[longest]), darks.cfa, darks.channels, _frames(darks, longest), drawn)
 
 
-def _frames(stack: FrameStack) -> np.ndarray:
-    return np.stack(list(stack.frames(0)))
+def _frames(stack: FrameStack, exposure: int) -> np.ndarray:
+    return np.stack(list(stack.frames(exposure)))
 
 
 def crop(frame: np.ndarray) -> np.ndarray:
