@@ -91,6 +91,9 @@ def _loop_arguments(commands: Any) -> None:
         )
         folder = f"hsnoise-{name}"
         parser.add_argument("--out", type=Path, default=Path(folder), metavar="FOLDER", help=f"default: {folder}")
+        parser.add_argument(
+            "--report", type=Path, metavar="FILE", help="write one page of HTML, figures included: report.html"
+        )
         parser.add_argument("--seed", type=int, default=0, help="of the model's samples (default 0)")
         _capture_arguments(parser)
 

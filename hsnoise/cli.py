@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 import hsnoise
-from hsnoise import _options, cameras
+from hsnoise import _options, cameras, report
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically
 from hsnoise._types import cfa_tile
@@ -40,6 +40,7 @@ OPTIONS = {
     "shutter": "--shutter",
     "kind": "--kind",
     "flats": "--flats",
+    "report": "--report",
 }
 
 MEANING = """\
@@ -127,26 +128,31 @@ def _fit_and_report(
 
 
 def _compare(args: argparse.Namespace) -> None:
-    _check_folder(args.out)
+    _check_outputs(args)
     model, stack = _model(args.model), _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
     with _busy("Drawing from the model"):
         found = hsnoise.compare(model, stack, seed=args.seed)
     _show(found, args.out / "comparison.png")
+    _write_report(args, found, stack, fit=model)
 
 
 def _diagnose(args: argparse.Namespace) -> None:
-    _check_folder(args.out)
+    _check_outputs(args)
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = _fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
     with _busy("Drawing every effect that may be missing"):
         found = hsnoise.diagnose(fitted, stack, seed=args.seed)
     _show(found, args.out / "ranking.png")
+    if args.report is not None:
+        with _busy("Comparing with the model's own samples"):
+            comparison = hsnoise.compare(getattr(fitted, "params", fitted), stack, seed=args.seed)
+        _write_report(args, found, stack, fit=fitted, comparison=comparison)
 
 
 def _improve(args: argparse.Namespace) -> None:
-    _check_folder(args.out)
+    _check_outputs(args)
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
     with _busy("Fitting the paper's model") as say:
@@ -156,6 +162,7 @@ def _improve(args: argparse.Namespace) -> None:
     written = _write_results(story.fit, args.out, {"files": args.paths, "errors": list(story.errors)}, figures=False)
     write_atomically(args.out / "story.txt", f"{story}\n".encode())
     print(f"Written to {args.out}/: {', '.join(written)}, story.txt")
+    _write_report(args, story, stack)
 
 
 def _sample(args: argparse.Namespace) -> None:
@@ -241,6 +248,15 @@ def _show(found, path: Path) -> None:
     print(f"Drawn in {path}")
 
 
+def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords: Any) -> None:
+    """Write the page that --report asks for, if it does."""
+    if args.report is None:
+        return
+    with _busy("Writing the report"):
+        report.write_report(args.report, found, stack, files=args.paths, seed=args.seed, **keywords)
+    print(f"Reported in {args.report}")
+
+
 def _write_figure(path: Path, figure) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
@@ -299,6 +315,13 @@ def _clean(path: str, mean_e: float | None, model: NoiseModel) -> np.ndarray:
 def _check_folder(path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise ValueError(f"--out: expected a folder, but {path} is a file")
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Before long work, so that it cannot be in vain."""
+    _check_folder(args.out)
+    if args.report is not None:
+        report.check_path(args.report, made=args.out)
 
 
 def _table(fit: FitResult, truth: NoiseModel | None) -> Table:

@@ -15,7 +15,7 @@ ROOT = Path(hsnoise.__file__).parent
 # A module may import those before it, and its own package.
 ORDER = """_types _keys _numerics _poisson _frames _arguments _output stack io effects model cameras photometry
     statistics structure draws rows physics moments plan likelihood coordinates maximise profile result notes lut
-    line_spectrum line synthetic fit plots criticism _options cli""".split()
+    line_spectrum line synthetic fit plots criticism report _options cli""".split()
 IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames"}
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"]
 
@@ -71,7 +71,7 @@ import sys, jax
 before = dict(jax.config.values)
 import hsnoise
 assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
-heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL"} & set(sys.modules)
+heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2"} & set(sys.modules)
 assert not heavy, heavy
 assert set(hsnoise.__all__) <= set(dir(hsnoise))
 """

@@ -51,12 +51,11 @@ class Comparison:
         return plots.comparison(self)
 
     def __str__(self) -> str:
-        table = Table(
-            "group of statistics", "misfit", title=f"error {self.error:.2f} (1.0: like the model's own samples)"
-        )
+        table = Table("group of statistics", "misfit")
         for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
             table.add_row(name, f"{misfit:.2f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(f"error {self.error:.2f} (1.0: like the model's own samples)", highlight=False)
         console.print(table)
         for sentence in (*self.worst, *self.skipped):
             console.print(f"- {sentence}", highlight=False)

@@ -78,11 +78,12 @@ class Diagnosis:
         return plots.ranking(self)
 
     def __str__(self) -> str:
-        title = {"named": f"missing: {', '.join(self.names)}", "ambiguous": f"missing: {' or '.join(self.names)}"}
-        table = Table("effect", "score / nats", "p", "misfit left", title=title.get(self.verdict, self.verdict))
+        title = {"named": f"missing: {' and '.join(self.names)}", "ambiguous": f"missing: {' or '.join(self.names)}"}
+        table = Table("effect", "score / nats", "p", "misfit left")
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:.1f}", f"{c.p_value:.2g}", f"{c.misfit:.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(title.get(self.verdict, self.verdict), highlight=False)
         console.print(table)
         if self.advice:
             console.print(f"- {self.advice}", highlight=False)

@@ -1,0 +1,185 @@
+"""What the page says: words and numbers for the template, from what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import hsnoise.result
+from hsnoise.criticism import Comparison, Diagnosis, Step, Story
+from hsnoise.model import NoiseModel
+from hsnoise.result import FitResult
+from hsnoise.stack import FrameStack
+
+CHANCE = 0.05  # p-value from which a misfit is taken for chance,
+CLEAR = 3.0  # unless the error is beyond this: few draws give no small p-value
+ALARM = 2.0  # times the worst group of the model's own samples
+LEAST_SHOWN = 0.1  # misfit at the left end of the bars
+MOST_CANDIDATES, MOST_FILES = 10, 3
+TITLES = {Comparison: "Model against measurement", Diagnosis: "What is missing", Story: "How the model was improved"}
+
+
+def context(
+    found: Comparison | Diagnosis | Story,
+    stack: FrameStack,
+    fit: FitResult | NoiseModel,
+    comparison: Comparison | None,
+    files: Sequence[str],
+) -> dict[str, Any]:
+    """All that the template needs but figures."""
+    diagnosis = found if isinstance(found, Diagnosis) else None
+    story = found if isinstance(found, Story) else None
+    if isinstance(found, Comparison):
+        comparison = found
+    elif story is not None:
+        comparison, diagnosis = story.steps[-1].comparison, story.steps[-1].diagnosis
+    return {
+        "title": TITLES[type(found)],
+        "verdict": verdict(found, comparison),
+        "good": is_good(found),
+        "capture": capture(stack, files),
+        "parameters": parameters(fit),
+        "notes": fit.notes if isinstance(fit, FitResult) else (),
+        "outcome": fit.outcome if isinstance(fit, FitResult) else "",
+        "bars": None if comparison is None else bars(comparison),
+        "comparison": comparison,
+        "diagnosis": diagnosis,
+        "ranking": [] if diagnosis is None else ranking(diagnosis),
+        "story": None if story is None else steps(story),
+        "ended": "" if story is None else story.ended,
+    }
+
+
+def verdict(found: Comparison | Diagnosis | Story, comparison: Comparison | None) -> str:
+    """The finding in one sentence."""
+    if isinstance(found, Story):
+        return _verdict_of_story(found)
+    error = "" if comparison is None else f"error {number(comparison.error)}"
+    yardstick = f"{error}, 1.0 would be as close as the model's own samples"
+    if isinstance(found, Comparison):
+        if is_good(found):
+            return f"The model describes these frames: {error}, where 1.0 is as close as its own samples."
+        worst = max(found.groups, key=found.groups.__getitem__)
+        return f"The model fails these frames, most of all in {worst}: {yardstick}."
+    after = f"; {yardstick}" if error else ""
+    if found.verdict == "nothing missing":
+        return f"Nothing significant is missing{f' ({error})' if error else ''}."
+    if found.verdict == "unexplained":
+        return f"Something is left that no effect of the library explains{after}."
+    return f"Missing: {' or '.join(found.names)}{after}."
+
+
+def _verdict_of_story(story: Story) -> str:
+    added = [step.added for step in story.steps if step.added]
+    if not added:
+        return story.ended
+    first, last = story.errors[0], story.errors[-1]
+    ended = story.ended[0].lower() + story.ended[1:]
+    return f"Added {', '.join(added)}, and the error fell from {number(first)} to {number(last)}; {ended}"
+
+
+def is_good(found: Comparison | Diagnosis | Story) -> bool:
+    """Whether nothing significant is left to find."""
+    if isinstance(found, Comparison):
+        return found.p_value > CHANCE and found.error < CLEAR
+    if isinstance(found, Story):
+        last = found.steps[-1].diagnosis
+        return last is not None and last.verdict == "nothing missing"
+    return found.verdict == "nothing missing"
+
+
+def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
+    """Files, size and exposures of a capture."""
+    rows, columns = stack.shape
+    more = [f"and {len(files) - MOST_FILES} more"] if len(files) > MOST_FILES else []
+    groups = [
+        f"{n} {kind}{'s' if n > 1 else ''} of {exposure:g} s"
+        for n, kind, exposure in zip(stack.n_frames, stack.kind, stack.exposure_s, strict=True)
+    ]
+    return {
+        "files": ", ".join([*files[:MOST_FILES], *more]),
+        "frames": f"{rows} x {columns} pixels, {stack.cfa}, {stack.shutter} shutter",
+        "groups": groups,
+    }
+
+
+def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
+    """Rows of the parameter table; "error" only for a FitResult."""
+    if isinstance(fit, NoiseModel):
+        return [{"name": name, "value": f"{v:.5g}", "unit": _unit(unit)} for name, (v, unit) in fit.table().items()]
+    return [
+        {
+            "name": name,
+            "value": hsnoise.result._digits(value, error),
+            "error": hsnoise.result._error(name, error, fit.names),
+            "unit": _unit(unit),
+        }
+        for name, (value, error, unit) in fit.table.items()
+    ]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def bars(comparison: Comparison) -> dict[str, Any]:
+    """Misfit of each group as a bar on a logarithmic scale, worst first; positions in percent of the width.
+
+    `own`: misfit that the worst group takes on the model's own samples.
+    """
+    groups = sorted(comparison.groups.items(), key=lambda item: -item[1])
+    own = groups[0][1] / comparison.error if comparison.error > 0 else 1.0
+    span = np.log(1.1 * max(groups[0][1], own, 10.0) / LEAST_SHOWN)
+
+    def at(misfit: float) -> str:
+        return f"{100 * max(np.log(max(misfit, LEAST_SHOWN) / LEAST_SHOWN) / span, 0.005):.2f}%"
+
+    shown = [{"name": g, "misfit": number(m), "width": at(m), "alarm": m > ALARM * own} for g, m in groups]
+    return {"groups": shown, "one": at(1.0), "own": at(own), "own_misfit": number(own)}
+
+
+def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Rows of the ranking table."""
+    return [
+        {
+            "name": c.name,
+            "score": f"{c.score:.1f}",
+            "p": f"{c.p_value:.2g}",
+            "misfit": f"{c.misfit:.1f}",
+            "named": c.name in diagnosis.names,
+        }
+        for c in diagnosis.ranking[:MOST_CANDIDATES]
+    ]
+
+
+def steps(story: Story) -> list[dict[str, Any]]:
+    """The additions of a story: what, why, the error before and after, what moved."""
+    return [
+        {
+            "added": after.added,
+            "why": _why(before),
+            "before": number(before.comparison.error),
+            "after": number(after.comparison.error),
+            "held_out": _gain(before, after),
+            "moved": after.moved,
+        }
+        for before, after in zip(story.steps[:-1], story.steps[1:], strict=True)
+    ]
+
+
+def _why(before: Step) -> list[str]:
+    """Reasons to add the effect that the diagnosis named, the strongest statistics last."""
+    score = [] if before.diagnosis is None else [f"its log-likelihood ratio is {before.diagnosis.ranking[0].score:.0f}"]
+    return [*score, *before.comparison.worst[:2]]
+
+
+def _gain(before: Step, after: Step) -> str:
+    change = after.held_out - before.held_out
+    return f"{change:+.1f} nats" if np.isfinite(change) else ""
+
+
+def number(value: float) -> str:
+    """Three digits, without exponent up to a million."""
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"

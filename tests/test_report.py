@@ -1,0 +1,277 @@
+"""The report is one page that stands alone, says what was found, and can be read on a phone and in the dark."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise import effects as fx
+from hsnoise import report
+from hsnoise.cli import main
+from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
+from hsnoise.criticism.diagnose import Unexplained
+from hsnoise.draws import draw_capture
+from hsnoise.report import _context, _figures, _measured
+from hsnoise.result import FitResult
+
+MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
+PLAIN = MODEL.remove("row_gain")  # its likelihood takes less time
+MONO = hsnoise.NoiseModel(
+    [
+        fx.ReadNoise(3.0),
+        fx.Gain(2.0),
+        fx.BlackLevel(64.0),
+        fx.ADC(),
+    ],
+    cfa="mono",
+    shutter="global",
+    exposure_s=0.1,
+)
+NASTY = "<script>alert(1)</script>&.npz"
+PHONE, DESKTOP = 390, 1280
+
+
+def capture(model=MODEL, shape=(64, 64), exposure_s=(0.05, 0.2)):
+    counts = np.random.default_rng(0).integers(60, 80, (len(exposure_s), 3, *shape)).astype(np.uint16)
+    like = hsnoise.FrameStack(counts, exposure_s, cfa=model.cfa, shutter=model.shutter)
+    return draw_capture(5, model, like)
+
+
+@pytest.fixture(scope="module")
+def stack():
+    return capture(PLAIN.add(fx.RowNoise(4.0)), exposure_s=(0.2,))
+
+
+@pytest.fixture(scope="module")
+def compared(stack):
+    return hsnoise.compare(PLAIN, stack, draws=8)
+
+
+def diagnosis(verdict="named", names=("row_noise",), advice=""):
+    ranking = (
+        Candidate("row_noise", fx.RowNoise(4.0), 812.3, 1e-9, 1.2),
+        Candidate("<i>own</i>", fx.RowNoise(1.0), 12.0, 0.01, 30.0),
+    )
+    left = Unexplained(1.2, "row x frame", ("row x frame: G (z = +44.0)",))
+    return Diagnosis(ranking, verdict, ranking[0] if names else None, names, advice, left)
+
+
+def comparison(error=1.1, p_value=0.5, worst=()):
+    groups = {"row x frame": 1.5 * error, "noise": 0.9}
+    return Comparison(error, groups, (), worst, p_value, -3.0, ("Curvature needs three exposures.",))
+
+
+@pytest.fixture(scope="module")
+def story(stack):
+    covariance = np.diag([0.01, 25.0])
+    fit = FitResult(
+        PLAIN, ("gain.R", "dark_current.rate"), covariance, "ml", "converged", 9, 0.0, ("A note.",), None, None
+    )
+    before = comparison(88.1, 0.02, ("row x frame: G: measured 4, the model gives 1",))
+    moved = ("gain.R moved from 3.1 to 3.5 DN/e-.",)
+    steps = (
+        Step(fit, before, diagnosis(), None, -100.0, ()),
+        Step(fit, comparison(), diagnosis("nothing missing", ()), "row_noise", -20.0, moved),
+    )
+    return Story(steps, "Nothing significant is left (error 1.10).")
+
+
+@pytest.fixture(scope="module")
+def pages(stack, compared, story):
+    return {
+        "compare": report.page(compared, stack, fit=PLAIN, files=[NASTY, "b", "c", "d", "e"]),
+        "diagnose": report.page(diagnosis(), stack, fit=story.fit, comparison=compared),
+        "improve": report.page(story, stack),
+    }
+
+
+class Elements(HTMLParser):
+    """Tags and attributes of a page, and its text without style sheets."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.words, self.ids = [], [], []
+        self.feed(page)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        if self.tags and self.tags[-1][0] != "style":
+            self.words.append(data)
+
+
+@pytest.mark.parametrize("command", ["compare", "diagnose", "improve"])
+def test_a_page_stands_alone(pages, command):
+    page = pages[command]
+    assert len(page.encode()) < 3_000_000
+    assert "http:" not in page and "https:" not in page and "@import" not in page
+    elements = Elements(page)
+    assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in elements.tags}
+    sources = [attributes["src"] for _, attributes in elements.tags if "src" in attributes]
+    assert len(sources) == 2 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert all(link.startswith("#") for _, a in elements.tags for name, link in a.items() if name.endswith("href"))
+    assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", page))
+    ids = [attributes["id"] for _, attributes in elements.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert dict(elements.tags[[tag for tag, _ in elements.tags].index("html")][1]) == {"lang": "en"}
+    assert any(a.get("name") == "viewport" for _, a in elements.tags) and "prefers-color-scheme: dark" in page
+
+
+def test_a_page_says_what_was_found(pages, compared):
+    said = {command: Elements(page).text for command, page in pages.items()}
+    worst = max(compared.groups, key=compared.groups.__getitem__)
+    error = _context.number(compared.error)
+    assert f"The model fails these frames, most of all in {worst}: error {error}, 1.0 would be" in said["compare"]
+    assert f"Missing: row_noise; error {error}, 1.0 would be as close" in said["diagnose"]
+    assert "Added row_noise, and the error fell from 88.1 to 1.1; nothing significant is left" in said["improve"]
+    assert "gain.R moved from 3.1 to 3.5 DN/e-." in said["improve"] and "+80.0 nats" in said["improve"]
+    assert "gain.R 3.54 0.1 DN/e-" in said["improve"] and "black_level.R 64 given DN" in said["improve"]
+    assert "standard error" in said["improve"] and "standard error" not in said["compare"]
+    assert "812.3" in said["diagnose"] and "Curvature needs three exposures." in said["improve"]
+    assert "b, c, and 2 more" in said["compare"]
+    for group in compared.groups:
+        assert group in said["compare"]
+
+
+def test_text_of_users_is_escaped(pages):
+    assert NASTY not in pages["compare"] and NASTY in Elements(pages["compare"]).text
+    assert "<i>own" not in pages["diagnose"] and "<i>own</i>" in Elements(pages["diagnose"]).text
+
+
+@pytest.mark.parametrize(
+    ("found", "said", "good"),
+    [
+        (comparison(), "The model describes these frames: error 1.1", True),
+        (comparison(5.0, 0.11), "The model fails these frames, most of all in row x frame: error 5, 1.0", False),
+        (diagnosis("nothing missing", ()), "Nothing significant is missing.", True),
+        (diagnosis("ambiguous", ("a", "b")), "Missing: a or b.", False),
+        (diagnosis("unexplained", ()), "Something is left that no effect of the library explains.", False),
+        (SimpleNamespace(steps=(SimpleNamespace(added=None),), ended="It stopped."), "It stopped.", None),
+    ],
+    ids=["good", "bad, few draws", "nothing", "ambiguous", "unexplained", "no step"],
+)
+def test_verdicts(found, said, good):
+    if good is None:
+        assert _context._verdict_of_story(found) == said
+        return
+    assert _context.verdict(found, found if isinstance(found, Comparison) else None).startswith(said)
+    assert _context.is_good(found) is good
+
+
+def test_bars_are_ordered_and_share_a_scale():
+    bars = _context.bars(comparison(40.0))
+    positions = [float(one["width"].rstrip("%")) for one in bars["groups"]]
+    assert [one["name"] for one in bars["groups"]] == ["row x frame", "noise"]
+    assert 100 > positions[0] > float(bars["own"].rstrip("%")) > float(bars["one"].rstrip("%")) > positions[1] > 0
+    assert [one["alarm"] for one in bars["groups"]] == [True, False]
+
+
+@pytest.mark.parametrize("axis", [0, 1], ids=["rows", "columns"])
+@pytest.mark.parametrize("channel", ["R", "G", "B"])
+def test_spectrum_of_white_lines_is_their_variance(channel, axis, rng):
+    lines = rng.normal(0, 3.0, (200, 64))
+    frames = lines[:, :, None] * np.ones(32) if axis == 0 else lines[:, None, :] * np.ones((32, 1))
+    k, power = _measured.line_spectrum(frames, "GRBG", channel, axis)
+    assert 0 < k[0] <= k[-1] <= (32 if channel == "G" else 16)
+    np.testing.assert_allclose(power, 9.0, rtol=0.35)
+
+
+def test_histogram_holds_every_pixel(stack):
+    at = _measured.shown(stack, PLAIN, 0)
+    at.measured[0, 0, 0] = 60000  # a hot pixel does not stretch the bins
+    for channel in at.channels:
+        edges = _measured.histogram_edges(at, channel)
+        share = _measured.share(at.measured, at.cfa, channel, edges)
+        assert len(share) <= _measured.MOST_BINS + 1
+        assert (share * np.diff(edges)).sum() == pytest.approx(1.0)
+
+
+def test_crop_keeps_the_colour_of_the_first_pixel():
+    row, column = np.indices((1001, 1303))
+    part = _measured.crop(2 * (row % 2) + column % 2)
+    assert part.shape == _measured.CROP and part[0, 0] == 0
+
+
+def test_mono_and_a_single_frame_of_each_exposure():
+    single = capture(MONO).select(frames=slice(0, 1))
+    page = report.page(diagnosis("nothing missing", ()), single, fit=MONO)
+    assert "all pixels, counts" in page and "var(--mono)" in page and "Where the model fails" not in page
+
+
+def test_a_figure_is_the_same_every_time(stack):
+    at = _measured.shown(stack, PLAIN, 0)
+    one, two = (_figures.svg(_figures.spectrum(at, "G", 0), "f", "a") for _ in range(2))
+    assert one == two
+
+
+def test_a_report_needs_a_model(compared, stack):
+    with pytest.raises(TypeError, match="fit"):
+        report.page(compared, stack)
+
+
+@pytest.mark.parametrize("path", ["page.pdf", "nowhere/page.html", "folder.html"])
+@pytest.mark.parametrize("command", ["compare", "diagnose", "improve"])
+def test_a_wrong_path_is_told_before_long_work(command, path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.html").mkdir()
+    model = ["--model", "grasshopper3"] if command == "compare" else []
+    # The capture does not exist: were it looked for first, the error would be another.
+    assert main([command, "no-capture.npz", *model, "--report", path]) == 2
+    assert capsys.readouterr().err.startswith("hsnoise: --report: ")
+    assert [one.name for one in tmp_path.iterdir()] == ["folder.html"]
+
+
+def test_the_command_line_writes_it(tmp_path, monkeypatch, compared, capsys):
+    MONO.save(tmp_path / "model.json")
+    darks = tmp_path / "darks.npz"
+    assert main(["sample", str(tmp_path / "model.json"), "--out", str(darks), "--frames", "3", "--shape", "32x64"]) == 0
+    monkeypatch.setattr(hsnoise, "compare", lambda *_, **__: compared)
+    out = tmp_path / "out"
+    arguments = ["--model", str(tmp_path / "model.json"), "--out", str(out), "--report", str(out / "report.html")]
+    assert main(["compare", str(darks), *arguments, "--debug"]) == 0
+    assert f"Reported in {out / 'report.html'}" in capsys.readouterr().out
+    assert "darks.npz" in (out / "report.html").read_text()
+    assert sorted(path.name for path in out.iterdir()) == ["comparison.png", "report.html"]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = next((path for path in map(shutil.which, names) if path), None)
+    if found is None:
+        pytest.skip(f"no browser: looked for {', '.join(names)}")
+    with playwright.sync_playwright() as running:
+        # The page is our own and asks no network, so it needs no sandbox, which containers lack.
+        browser = running.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+@pytest.mark.parametrize("command", ["compare", "diagnose", "improve"])
+def test_nothing_overflows(pages, command, width, scheme, browser, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(pages[command])
+    shown = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    asked, errors = [], []
+    shown.on("request", lambda request: asked.append(request.url))
+    shown.on("pageerror", lambda error: errors.append(error))
+    shown.goto(path.as_uri())
+    assert shown.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert shown.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert shown.evaluate("[...document.querySelectorAll('svg')].every(one => one.getBoundingClientRect().width > 200)")
+    assert [url for url in asked if not url.startswith(("data:", "file:"))] == [] and errors == []
+    background = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert background == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 23, 26)")
+    shown.close()
