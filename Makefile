@@ -1,4 +1,4 @@
-# make demo              simulate a small capture, fit it, show the result beside the truth
+# make demo              the loop on a simulated capture that hides an effect: error before and after
 # make demo DATA=path    the same on dark frames of your own
 # make test              the tests that take a few minutes
 # make test-slow         all tests that need no accelerator, browser or stop-watch

@@ -34,16 +34,16 @@ def parser() -> argparse.ArgumentParser:
 
 def _demo_arguments(commands: Any) -> None:
     text = (
-        "Simulate a small dark capture of a Canon 5D Mark III at ISO 25600, fit it, and show the fit beside the truth."
+        "Simulate a small dark capture of a Canon 5D Mark III at ISO 25600 with an effect hidden in it, fit it, find "
+        "what is missing, add it, and show the fit beside the truth. Takes a few minutes."
     )
     demo = commands.add_parser(
         "demo", help="see what hsnoise does, on simulated or on your own frames", description=text
     )
     demo.add_argument(
-        "--data", nargs="+", metavar="PATH", help="fit these dark frames instead: a folder, files or a pattern"
+        "--data", nargs="+", metavar="PATH", help="take these dark frames instead: a folder, files or a pattern"
     )
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
-    _method_argument(demo)
     _capture_arguments(demo)
 
 

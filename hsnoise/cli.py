@@ -13,23 +13,25 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, track
-from rich.table import Table
 
 import hsnoise
 from hsnoise import _options, cameras, report
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically
+from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
+from hsnoise.criticism import Story
+from hsnoise.effects import RowNoise
 from hsnoise.fit import FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.photometry import scale_to_photoelectrons
 from hsnoise.stack import FrameStack
 
 SAMPLE_SHAPE = (480, 640)
-DEMO_EXPOSURES_S, DEMO_FRAMES, DEMO_SHAPE, DEMO_SEED = (0.05, 0.1, 0.2, 0.4), 8, (160, 240), 0
+DEMO_EXPOSURES_S, DEMO_FRAMES, DEMO_SHAPE, DEMO_SEED = (0.05, 0.1, 0.2, 0.4), 8, (96, 160), 0
+DEMO_HIDDEN = RowNoise(1.5)
 
 OPTIONS = {
     "exposure_s": "--exposure",
@@ -83,48 +85,52 @@ def _sentence(error: Exception) -> str:
 
 
 def _demo(args: argparse.Namespace) -> None:
-    console, out = Console(highlight=False), args.out
-    _check_folder(out)
+    _check_folder(args.out)
     if args.data:
-        _fit_and_report(console, _load(args.data, args), args.method, out, {"files": args.data}, truth=None)
-        return
-    truth = cameras.canon_5d3()
+        stack, truth, source = _load(args.data, args), None, {"files": args.data}
+        stack.check()
+    else:
+        stack, truth, source = *_simulated(args.out), {"simulated": "canon_5d3 with row noise", "seed": DEMO_SEED}
+    args.out.mkdir(parents=True, exist_ok=True)
+    print(f"{stack}\nFitting them, finding what the model lacks, and fitting again: a few minutes ...")
+    story = _improve_with_progress(stack, DEMO_SEED)
+    _tell(story, args.out, source, truth)
+    if truth is not None:
+        print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
+        print(f"Hidden in these frames was {DEMO_HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
+    added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
+    print(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
+
+
+def _simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
+    """Darks with a hidden effect, kept as capture.npz, and the model that they are drawn from."""
+    truth = cameras.canon_5d3().add(DEMO_HIDDEN)
     rows, columns = DEMO_SHAPE
-    console.print(f"Simulating {len(DEMO_EXPOSURES_S) * DEMO_FRAMES} dark frames of {rows} x {columns} pixels ...")
+    print(f"Simulating {len(DEMO_EXPOSURES_S) * DEMO_FRAMES} dark frames of {rows} x {columns} pixels ...")
     counts = _draw(truth, DEMO_EXPOSURES_S, DEMO_FRAMES, np.zeros(DEMO_SHAPE, np.float32), DEMO_SEED)
     metadata = _metadata(truth, DEMO_EXPOSURES_S, "dark")
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / "capture.npz", frames_file(".npz", counts, metadata))
-    stack = FrameStack(counts, **metadata)
-    _fit_and_report(console, stack, args.method, out, {"simulated": "canon_5d3", "seed": DEMO_SEED}, truth=truth)
-    again = f"The simulated frames are there, too. Fit them again with: hsnoise fit {out / 'capture.npz'}"
-    console.print(again, markup=False, soft_wrap=True)
+    return FrameStack(counts, **metadata), truth
 
 
 def _fit(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     stack = _load(args.paths, args)
-    _fit_and_report(Console(highlight=False), stack, args.method, args.out, {"files": args.paths}, truth=None)
-
-
-def _fit_and_report(
-    console: Console, stack: FrameStack, method: str, out: Path, source: dict[str, Any], truth: NoiseModel | None
-) -> None:
     stack.check()
+    console, out = Console(highlight=False), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
-    fit = _fit_with_progress(stack, method)
-    console.print(_table(fit, truth))
+    fit = _fit_with_progress(stack, args.method)
+    console.print(table_of(fit))
     console.print(
         f"Fit by {'maximum likelihood' if fit.method == 'ml' else 'the line method'}: {fit.outcome}", markup=False
     )
     for note in fit.notes:
         console.print(f"- {note}", style="yellow", markup=False)
-    written = _write_results(fit, out, source)
+    written = _write_results(fit, out, {"files": args.paths})
     console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
     console.print(MEANING, markup=False)
-    if truth is not None:
-        console.print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -155,14 +161,21 @@ def _improve(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    with _busy("Fitting the paper's model") as say:
-        story = hsnoise.improve(stack, seed=args.seed, progress=say)
-    _show(story, args.out / "story.png")
-    print(story.fit)
-    written = _write_results(story.fit, args.out, {"files": args.paths, "errors": list(story.errors)}, figures=False)
-    write_atomically(args.out / "story.txt", f"{story}\n".encode())
-    print(f"Written to {args.out}/: {', '.join(written)}, story.txt")
+    story = _improve_with_progress(stack, args.seed)
+    _tell(story, args.out, {"files": args.paths}, None)
     _write_report(args, story, stack)
+
+
+def _tell(story: Story, out: Path, source: dict[str, Any], truth: NoiseModel | None) -> None:
+    """Print the story and its last fit, and write both."""
+    _show(story, out / "story.png")
+    console = Console(highlight=False)
+    console.print(table_of(story.fit, truth))
+    for note in story.fit.notes:
+        console.print(f"- {note}", style="yellow", markup=False)
+    written = _write_results(story.fit, out, {**source, "errors": list(story.errors)}, figures=False)
+    write_atomically(out / "story.txt", f"{story}\n".encode())
+    print(f"Written to {out}/: {', '.join(written)}, story.txt")
 
 
 def _sample(args: argparse.Namespace) -> None:
@@ -229,6 +242,11 @@ def _fit_with_progress(stack: FrameStack, method: str) -> FitResult:
                 progress.add_task("Fitting", total=None)
 
         return hsnoise.fit(stack, method=method, progress=tick)
+
+
+def _improve_with_progress(stack: FrameStack, seed: int) -> Story:
+    with _busy("Fitting the paper's model") as say:
+        return hsnoise.improve(stack, seed=seed, progress=say)
 
 
 @contextmanager
@@ -322,36 +340,6 @@ def _check_outputs(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     if args.report is not None:
         report.check_path(args.report, made=args.out)
-
-
-def _table(fit: FitResult, truth: NoiseModel | None) -> Table:
-    table = Table(box=SIMPLE_HEAD)
-    table.add_column("parameter", no_wrap=True)
-    for name in ("value", "standard error"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("unit")
-    true_values = {} if truth is None else truth.table()
-    if truth is not None:
-        table.add_column("truth", justify="right", no_wrap=True)
-        table.add_column("off by", justify="right", no_wrap=True)
-    for name, (value, error, unit) in fit.table.items():
-        cells = [name, *_rounded(value, error), "" if unit == "1" else unit]
-        if name in true_values:
-            true_value = true_values[name][0]
-            known = error > 0 and np.isfinite(error)
-            cells += [_rounded(true_value, error)[0], f"{(value - true_value) / error:+.1f} s.e." if known else ""]
-        table.add_row(*cells)
-    return table
-
-
-def _rounded(value: float, error: float) -> tuple[str, str]:
-    """Value and standard error with the digits that the error leaves meaning to."""
-    if not (np.isfinite(error) and error > 0):
-        return f"{value:.4g}", "given" if error == 0 else "not determined"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
-    if digits > 6 or error >= 1e4:
-        return f"{value:.3e}", f"{error:.1e}"
-    return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
 def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bool = True) -> list[str]:

@@ -13,6 +13,7 @@ import pytest
 import hsnoise
 from hsnoise import _options, _output, cli
 from hsnoise.cli import main
+from hsnoise.criticism import Comparison, Step, Story
 
 COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample")
 
@@ -86,7 +87,20 @@ def test_fitted_model_can_be_sampled(fitted, tmp_path, capsys):
     assert (stack.n_frames, stack.shape, stack.shutter, stack.black_level) == ((2,), (16, 32), "global", 64.0)
 
 
-def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def short_loop(monkeypatch):
+    """The loop without its draws: the first fit, and an addition made up."""
+
+    def improve(stack, **_):
+        fit, groups = hsnoise.fit(stack), {"noise": 1.0}
+        errors = [Comparison(error, groups, (), (), 0.5, -3.0, ()) for error in (40.0, 1.2)]
+        steps = [Step(fit, e, None, added, -9.0, ()) for e, added in zip(errors, (None, "row_noise"), strict=True)]
+        return Story(tuple(steps), "Nothing significant is left.")
+
+    monkeypatch.setattr(hsnoise, "improve", improve)
+
+
+def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, short_loop):
     monkeypatch.setattr(cli, "DEMO_FRAMES", 2)
     monkeypatch.setattr(cli, "DEMO_SHAPE", (32, 64))
     monkeypatch.setattr(cli, "DEMO_EXPOSURES_S", (0.1, 0.4))
@@ -97,11 +111,12 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys):
     assert lines["gain.R"][3] == "DN/e-"
     assert float(lines["gain.R"][4]) == pytest.approx(1.53, abs=0.05)
     assert lines["black_level.R"][2] == "given"
-    assert {path.name for path in out.iterdir()} >= {"capture.npz", "model.json", "table.csv", "histograms.png"}
-    assert "truth" in said and "Written to" in said.replace("\n", " ")
+    assert {path.name for path in out.iterdir()} >= {"capture.npz", "model.json", "table.csv", "story.png"}
+    assert "truth" in said and "Hidden in these frames was row_noise" in said
+    assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 
-def test_demo_takes_data(capture, tmp_path, capsys):
+def test_demo_takes_data(capture, tmp_path, capsys, short_loop):
     arguments = ["--data", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "out")]
     assert main(["demo", *arguments]) == 0
     said = capsys.readouterr().out

@@ -14,8 +14,8 @@ class ColumnNoise(AbstractEffect):
     """Offset of each column, e-, new in each frame, the same for all colours of the column.
 
     Column amplifiers that sample their reference once a frame hold its noise for all rows. One normal series runs
-    over all sensor columns, white or with power k^-exponent (k cycles per frame, no DC term, as in
-    `coloured_normal`).
+    over all sensor columns, white or with power k^-exponent (k cycles per frame; the DC term
+    fades out toward exponent 1).
 
     In dark frames: vertical streaks that change from frame to frame, equally strong in all colours and exposures.
 
@@ -29,5 +29,5 @@ class ColumnNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, _, columns = signal.shape
-        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype)
+        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype, fading_dc=True)
         return signal + self.sigma * jnp.swapaxes(series, 1, 2)

@@ -13,8 +13,8 @@ class RowNoise(AbstractEffect):
 
     All pixels of a row are sampled at once, so noise of supplies and references in that moment is common to them;
     circuits know no colours. One normal series runs over all sensor rows, white or with power k^-exponent (k cycles
-    per frame, no DC term, as in `coloured_normal`); slow noise of the supplies is 1/f. It follows the time of readout,
-    so the shutter does not matter.
+    per frame; the DC term fades out toward exponent 1); slow noise of the supplies is 1/f. It follows the time of
+    readout, so the shutter does not matter.
 
     In dark frames: horizontal streaks that change from frame to frame, equally strong in all colours and exposures.
 
@@ -28,4 +28,6 @@ class RowNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        return signal + self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)
+        return signal + self.sigma * coloured_normal(
+            key, (frames, rows, 1), self.exponent, signal.dtype, fading_dc=True
+        )
