@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
 
@@ -40,12 +41,13 @@ def ranking(found) -> Figure:
         found: result of `hsnoise.diagnose`.
     """
     chosen = found.ranking[:MOST_BARS][::-1]
-    title = f"Verdict: {found.verdict} {', '.join(found.names)}".rstrip()
+    joined = (" or " if found.verdict == "ambiguous" else " and ").join(found.names)
+    title = f"Missing: {joined}" if joined else found.verdict.capitalize()
     figure = new_figure(7.5, 0.32 * len(chosen) + 1.6, title)
     axes = figure.subplots()
-    scores = np.maximum([c.score for c in chosen], 0.1)
-    axes.barh([c.name for c in chosen], scores, color=[ALARM if c.name in found.names else BAR for c in chosen])
-    axes.set_xscale("log")
+    colours = [ALARM if c.name in found.names else BAR for c in chosen]
+    axes.barh([c.name for c in chosen], [c.score for c in chosen], color=colours)
+    _wide_scale(axes)
     axes.set_xlabel("log-likelihood ratio against nothing missing / nats")
     tidy(axes)
     return figure
@@ -76,6 +78,20 @@ def story(found) -> Figure:
 
 def _bars(axes: Axes, names: list[str], values: np.ndarray) -> None:
     axes.barh(names, values, color=[ALARM if abs(v) > NOTABLE else BAR for v in values])
-    axes.set_xscale("symlog", linthresh=5)
-    axes.axvline(0, color=FIT, linewidth=0.8)
+    _wide_scale(axes)
     tidy(axes)
+
+
+def _wide_scale(axes: Axes) -> None:
+    """Linear up to 5, logarithmic beyond, either sign, with plain numbers and not too many of them."""
+    low, high = axes.dataLim.x0, axes.dataLim.x1
+    axes.set_xscale("symlog", linthresh=5)
+    axes.set_xlim(min(1.4 * low, 0), max(1.4 * high, 0))
+    far = max(high, -low)
+    ticks = [5, 10, 20, 50, 100, 200] if far < 300 else [5.0 * 10**k for k in range(0, 9, 1 if far < 1e4 else 2)]
+    axes.set_xticks(
+        [x for x in [*(-t for t in ticks[::-1]), 0, *ticks] if 1.4 * min(low, 0) <= x <= 1.4 * max(high, 0)]
+    )
+    axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.axvline(0, color=FIT, linewidth=0.8)
