@@ -192,10 +192,11 @@ def log_probability(physics: Physics, at: Binning, beta):
 
 
 def black_level_at(physics: Physics, exposure_s):
-    """Where the counts of pixels without electrons lie, DN [..., channel], from exposure_s [..., 1] or a scalar."""
-    if physics.black_clamp is None:
-        return physics.black_level
-    return physics.black_level - physics.black_clamp * exposure_s
+    """Where counts without electrons lie, DN: [channel] at a scalar exposure_s, [level, channel] at [level]."""
+    clamp = 0.0 * physics.gain if physics.black_clamp is None else physics.black_clamp
+    if jnp.ndim(exposure_s) == 0:
+        return physics.black_level - clamp * exposure_s
+    return physics.black_level[None, :] - clamp[None, :] * jnp.asarray(exposure_s)[:, None]
 
 
 def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
@@ -205,7 +206,7 @@ def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
     where the photons are known the mean itself counts (EMVA 1288 release 4, section 6).
     """
     flats = summary.flats
-    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s[:, None])
+    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s)
     row_variance = jnp.zeros_like(gain) if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
     signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
     variance = flat_variance(physics, flats)
@@ -224,7 +225,7 @@ def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
 
 def flat_variance(physics: Physics, flats: FlatMoments):
     """Expected temporal variance within rows [level, channel], DN^2: the photon transfer line."""
-    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s[:, None])
+    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s)
     row_variance = 0.0 if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
     signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
     return (gain * signal + (gain * physics.read_noise) ** 2) * (1 + row_variance) + ROUNDING_VARIANCE
