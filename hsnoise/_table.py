@@ -7,7 +7,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult
+from hsnoise.result import FitResult, rounded
 
 
 def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
@@ -22,20 +22,10 @@ def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
         table.add_column("truth", justify="right", no_wrap=True)
         table.add_column("off by", justify="right", no_wrap=True)
     for name, (value, error, unit) in fit.table.items():
-        cells = [name, *_rounded(value, error), "" if unit == "1" else unit]
+        cells = [name, *rounded(value, error), "" if unit == "1" else unit]
         if name in true_values:
             true_value = true_values[name][0]
             known = error > 0 and np.isfinite(error)
-            cells += [_rounded(true_value, error)[0], f"{(value - true_value) / error:+.1f} s.e." if known else ""]
+            cells += [rounded(true_value, error)[0], f"{(value - true_value) / error:+.1f} s.e." if known else ""]
         table.add_row(*cells)
     return table
-
-
-def _rounded(value: float, error: float) -> tuple[str, str]:
-    """Value and standard error with the digits that the error leaves meaning to."""
-    if not (np.isfinite(error) and error > 0):
-        return f"{value:.4g}", "given" if error == 0 else "not determined"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
-    if digits > 6 or error >= 1e4:
-        return f"{value:.3e}", f"{error:.1e}"
-    return f"{value:.{digits}f}", f"{error:.{digits}f}"

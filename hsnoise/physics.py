@@ -196,7 +196,7 @@ def black_level_at(physics: Physics, exposure_s):
     clamp = 0.0 * physics.gain if physics.black_clamp is None else physics.black_clamp
     if jnp.ndim(exposure_s) == 0:
         return physics.black_level - clamp * exposure_s
-    return physics.black_level[None, :] - clamp[None, :] * jnp.asarray(exposure_s)[:, None]
+    return physics.black_level[None, :] - clamp[None, :] * exposure_s[:, None]
 
 
 def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:

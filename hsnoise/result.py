@@ -85,7 +85,7 @@ class FitResult:
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
         for name, (value, error, unit) in self.table.items():
-            table.add_row(name, _digits(value, error), _error(name, error, self.names), unit)
+            table.add_row(name, *rounded(value, error), unit)
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(f"{title}: {darks}{flats}", highlight=False)
         console.print(table)
@@ -119,15 +119,11 @@ def _expected(physics: Physics, c: int, summary: Summary) -> tuple[jax.Array, ja
     return jax.lax.map(exposure, binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures)))
 
 
-def _digits(value: float, error: float) -> str:
-    """The value to the second digit of its error."""
-    if not np.isfinite(error) or error <= 0:
-        return f"{value:.5g}"
-    places = int(np.clip(1 - np.floor(np.log10(error)), 0, 8))
-    return f"{value:.{places}f}"
-
-
-def _error(name: str, error: float, fitted: tuple[str, ...]) -> str:
-    if name not in fitted:
-        return "given" if error == 0 else "not determined"
-    return "not determined" if not np.isfinite(error) else f"{error:.2g}"
+def rounded(value: float, error: float) -> tuple[str, str]:
+    """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
+    if not (np.isfinite(error) and error > 0):
+        return f"{value:.5g}", "given" if error == 0 else "not determined"
+    digits = max(0, 1 - int(np.floor(np.log10(error))))
+    if digits > 6 or error >= 1e4:
+        return f"{value:.3e}", f"{error:.1e}"
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"

@@ -22,7 +22,7 @@ from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
-from hsnoise.criticism.reference import Reference, measure, reference
+from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_fits, darks_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -71,6 +71,13 @@ class Diagnosis:
     advice: str
     unexplained: Unexplained
 
+    @property
+    def headline(self) -> str:
+        """The verdict in a few words: "missing: row_noise and hot_pixels"."""
+        if not self.names:
+            return self.verdict
+        return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
+
     def plot(self):
         """A figure of the ranking: `hsnoise.plots.ranking`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -78,12 +85,11 @@ class Diagnosis:
         return plots.ranking(self)
 
     def __str__(self) -> str:
-        title = {"named": f"missing: {' and '.join(self.names)}", "ambiguous": f"missing: {' or '.join(self.names)}"}
         table = Table("effect", "score / nats", "p", "misfit left")
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:.1f}", f"{c.p_value:.2g}", f"{c.misfit:.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(title.get(self.verdict, self.verdict), highlight=False)
+        console.print(self.headline, highlight=False)
         console.print(table)
         if self.advice:
             console.print(f"- {self.advice}", highlight=False)
@@ -118,7 +124,9 @@ def diagnose(
     makers = built_in(model, darks) | own
     bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
     null = shrunk(bench.base.own_z(), bench.slopes())
-    evidence = Evidence(bench.base.z(measure(darks, model).values), null, bench.base.groups, len(makers))
+    evidence = Evidence(
+        bench.base.z(measure(darks, model).values), null, bench.base.names, bench.base.groups, len(makers)
+    )
     prints = [bench.fingerprint(name, maker, AMPLITUDES, DETAILS) for name, maker in makers.items()]
     judged = _best_first(judge(of, evidence) for of in prints)
     pair = None
@@ -127,12 +135,12 @@ def diagnose(
         if judged[0].misfit > MISFIT_LEFT:
             pair = best_pair(judged, evidence)
     ranking = [one.candidate(evidence) for one in judged]
-    found = _verdict(ranking, pair, evidence, bench.base)
+    found = _verdict(ranking, pair, evidence)
     if found.verdict == "unexplained" or CLAMP in [c.name for c in ranking[:2] if c.score > EVIDENCE]:
         clamp = clamp_by_likelihood(fit, bench, evidence)
         if clamp is not None:
             others = [c for c in ranking if c.name != CLAMP]
-            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence, bench.base)
+            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence)
     return found
 
 
@@ -161,8 +169,8 @@ def _own(candidates: Any, model) -> dict[str, Maker]:
     return makers
 
 
-def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, base: Reference) -> Diagnosis:
-    scores = evidence.null.normal_scores(evidence.z, base.groups)
+def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) -> Diagnosis:
+    scores = evidence.null.normal_scores(evidence.z, evidence.groups)
     worst = max(scores.values())
     allowed = max(MISFIT_LEFT, SHARE_LEFT * worst)
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
@@ -191,7 +199,7 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, ba
         best=first if names else None,
         names=names,
         advice=_advice(verdict, names, first, group),
-        unexplained=Unexplained(left, group, tuple(f"{base.names[i]} (z = {evidence.z[i]:+.1f})" for i in order)),
+        unexplained=Unexplained(left, group, tuple(f"{evidence.names[i]} (z = {evidence.z[i]:+.1f})" for i in order)),
     )
 
 

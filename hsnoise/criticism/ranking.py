@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,16 +38,22 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the candidates are judged by: z [statistic] of the capture, its law if nothing is missing, groups."""
+    """What the candidates are judged by: z [statistic] of the capture, its law if nothing is missing, names, groups."""
 
     z: np.ndarray
     null: Gaussian
+    names: tuple[str, ...]
     groups: tuple[str, ...]
     candidates: int
 
+    @cached_property
+    def nothing(self) -> float:
+        """Log density of the capture if nothing is missing."""
+        return float(self.null.log_density(self.z))
+
     def score(self, law: Gaussian) -> float:
         """Log-likelihood ratio of a law against "nothing missing"."""
-        return float(law.log_density(self.z) - self.null.log_density(self.z))
+        return float(law.log_density(self.z)) - self.nothing
 
     def misfit(self, law: Gaussian) -> float:
         return max(law.normal_scores(self.z, self.groups).values())
@@ -93,8 +100,9 @@ def best_pair(judged: list[Judged], evidence: Evidence) -> Pair | None:
     """The pair that describes the capture best, of the leading candidates with all others; `judged` is best first."""
     best: tuple[float, tuple[Judged, Judged], Gaussian] | None = None
     for i, first in enumerate(judged[:LEADERS]):
+        alone = [first.of.law(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude]
         for second in judged[i + 1 :]:
-            for law in _laws_together(first, second, evidence.null):
+            for law in _laws_together(alone, second, evidence.null):
                 score = evidence.score(law)
                 if best is None or score > best[0]:
                     best = score, (first, second), law
@@ -104,10 +112,9 @@ def best_pair(judged: list[Judged], evidence: Evidence) -> Pair | None:
     return Pair((first.of.name, second.of.name), score, evidence.misfit(law))
 
 
-def _laws_together(first: Judged, second: Judged, null: Gaussian):
-    """Laws with both effects in the sensor: shifts and scatters add."""
-    for a in PAIR_FIRST * first.amplitude:
-        one = first.of.law(float(a), null)
-        for b in PAIR_SECOND:
-            other = second.of.law(float(b), null)
+def _laws_together(alone: list[Gaussian], second: Judged, null: Gaussian):
+    """Laws with both effects in the sensor, `alone` those of the first: shifts and scatters add."""
+    for b in PAIR_SECOND:
+        other = second.of.law(float(b), null)
+        for one in alone:
             yield Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)

@@ -41,9 +41,7 @@ def ranking(found) -> Figure:
         found: result of `hsnoise.diagnose`.
     """
     chosen = found.ranking[:MOST_BARS][::-1]
-    joined = (" or " if found.verdict == "ambiguous" else " and ").join(found.names)
-    title = f"Missing: {joined}" if joined else found.verdict.capitalize()
-    figure = new_figure(7.5, 0.32 * len(chosen) + 1.6, title)
+    figure = new_figure(7.5, 0.32 * len(chosen) + 1.6, found.headline[0].upper() + found.headline[1:])
     axes = figure.subplots()
     colours = [ALARM if c.name in found.names else BAR for c in chosen]
     axes.barh([c.name for c in chosen], [c.score for c in chosen], color=colours)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.lut import clipped_moments
-from hsnoise.physics import Physics
+from hsnoise.physics import Physics, black_level_at
 
 BETA_NODES = 32
 LEAST_BETA = 1e-6
@@ -25,11 +25,12 @@ def count_moments(physics: Physics, c: int, exposure_s, beta, white_level_dn: fl
     """
     gain = float(physics.gain[c]) * np.maximum(np.asarray(beta)[None, :], LEAST_BETA)
     mean_e = float(physics.dark_current) * np.asarray(exposure_s)[:, None]
+    black = black_level_at(physics, np.asarray(exposure_s))[:, c, None]
     mean, variance = clipped_moments(
         gain * mean_e,
         gain**2 * (mean_e + float(physics.read_noise) ** 2),
         gain=gain + 0 * mean_e,
-        black_level_dn=float(physics.black_level[c]),
+        black_level_dn=black + 0 * gain,
         white_level_dn=white_level_dn,
     )
     return np.asarray(mean), np.asarray(variance)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.physics import ROUNDING_VARIANCE, Physics
+from hsnoise.physics import ROUNDING_VARIANCE, Physics, black_level_at
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy
 from hsnoise.statistics import RowHistograms, Summary
@@ -44,7 +44,7 @@ def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
     t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
-        channel, black = histograms.channel, float(physics.black_level[c])
+        channel, black = histograms.channel, black_level_at(physics, summary.exposure_s)[:, c]
         colour = COLOURS[channel]
         mean, variance, error = _within_rows(histograms)
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION
@@ -67,7 +67,7 @@ def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
     flats = summary.flats
     white = np.inf if summary.white_level_dn is None else summary.white_level_dn
     for c, channel in enumerate(summary.channels):
-        black = float(physics.black_level[c])
+        black = black_level_at(physics, flats.exposure_s)[:, c]
         signal, variance = flats.mean_dn[:, c] - black, flats.variance_dn2[:, c]
         clipped = (flats.mean_dn[:, c] + 3 * np.sqrt(variance) > white) | (flats.mean_dn[:, c] < 3 * np.sqrt(variance))
         _points(axes, channel, signal, variance, clipped, variance * np.sqrt(2 / flats.dof[:, c]))

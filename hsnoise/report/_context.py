@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-import hsnoise.result
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult
+from hsnoise.result import FitResult, rounded
 from hsnoise.stack import FrameStack
 
 CHANCE = 0.05  # p-value from which a misfit is taken for chance,
@@ -68,7 +67,7 @@ def verdict(found: Comparison | Diagnosis | Story, comparison: Comparison | None
         return f"Nothing significant is missing{f' ({error})' if error else ''}."
     if found.verdict == "unexplained":
         return f"Something is left that no effect of the library explains{after}."
-    return f"Missing: {' or '.join(found.names)}{after}."
+    return f"{found.headline[0].upper()}{found.headline[1:]}{after}."
 
 
 def _verdict_of_story(story: Story) -> str:
@@ -109,15 +108,8 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     """Rows of the parameter table; "error" only for a FitResult."""
     if isinstance(fit, NoiseModel):
         return [{"name": name, "value": f"{v:.5g}", "unit": _unit(unit)} for name, (v, unit) in fit.table().items()]
-    return [
-        {
-            "name": name,
-            "value": hsnoise.result._digits(value, error),
-            "error": hsnoise.result._error(name, error, fit.names),
-            "unit": _unit(unit),
-        }
-        for name, (value, error, unit) in fit.table.items()
-    ]
+    rows = [(name, *rounded(value, error), _unit(unit)) for name, (value, error, unit) in fit.table.items()]
+    return [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in rows]
 
 
 def _unit(unit: str) -> str:

@@ -10,6 +10,7 @@ from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Evidence, best_pair, judge
 
 STATISTICS, AMPLITUDES = 40, (0.35, 1.0, 2.5)
+NAMES = tuple(f"statistic {i}" for i in range(STATISTICS))
 GROUPS = tuple("abcd"[i // 10] for i in range(STATISTICS))
 
 
@@ -29,7 +30,7 @@ PRINTS = [fingerprint("left", slice(0, 5)), fingerprint("middle", slice(12, 18))
 def evidence(*hidden: Fingerprint, amplitude: float = 0.8) -> Evidence:
     noise = np.random.default_rng(5).standard_normal(STATISTICS)
     z = noise + sum(of.at(amplitude).mean(0) for of in hidden)
-    return Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), GROUPS, len(PRINTS))
+    return Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), NAMES, GROUPS, len(PRINTS))
 
 
 def test_single_effect_is_first_and_leaves_nothing():
