@@ -11,11 +11,13 @@ import jax
 import numpy as np
 
 from hsnoise._keys import named_key
-from hsnoise.model import NoiseModel, sample_dark_by_effect
+from hsnoise.effects import Stage
+from hsnoise.model import NoiseModel, dark_signals, sample_dark_by_effect
 from hsnoise.stack import FrameStack
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
 
 
@@ -47,6 +49,27 @@ def check_fits(model: NoiseModel, stack: FrameStack) -> None:
         raise ValueError(
             f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter}"
         )
+
+
+def check_effects(model: NoiseModel, like: FrameStack) -> None:
+    """Raise ValueError, naming the effect, if one of them returns another shape, NaN or numbers of another unit.
+
+    One frame of the longest exposure is drawn, effect by effect.
+    """
+    gain = float(np.mean(np.asarray(model["gain"].value))) if "gain" in model else 1.0
+    white_dn = 2.0**16 if like.white_level is None else float(like.white_level)
+    for effect, signal in dark_signals(jax.random.key(0), 1, like.shape, model, exposure_s=float(max(like.exposure_s))):
+        values = np.asarray(signal, float)
+        unit, largest = ("e-", white_dn / gain) if effect.stage < Stage.GAIN else ("DN", white_dn)
+        bad = ~np.isfinite(values)
+        if bad.any():
+            raise ValueError(f"{effect.name}: its sample returned NaN or infinity for {bad.mean():.2g} of the pixels.")
+        typical = float(np.sqrt(np.mean(values**2)))
+        if typical > MOST_RANGES * largest:
+            raise ValueError(
+                f"{effect.name}: its sample returned a signal of {typical:.3g} {unit} (rms) in a dark frame, where the"
+                f" camera holds {largest:.3g}; are its parameters in the units that it declares?"
+            )
 
 
 def black_level_of(model: NoiseModel) -> np.ndarray:

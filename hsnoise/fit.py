@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import coordinates_for, labels
+from hsnoise.draws import check_effects, check_fits
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.line import line_fit
 from hsnoise.maximise import maximise
@@ -96,6 +97,8 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
     if isinstance(stack, Summary):
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
     stack = as_stack(stack, **keywords)
+    check_fits(model, stack)
+    check_effects(model, stack)
     bare = model
     for name in extra:
         bare = bare.remove(name)

@@ -214,7 +214,8 @@ def sample(
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
     """
-    return _draw(_apply_in_one, key, clean, params, exposure_s, sensor_key)
+    signal, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
+    return _apply_in_one(key, signal, effects, capture).reshape(np.shape(clean))
 
 
 def sample_dark(
@@ -245,10 +246,19 @@ def sample_dark_by_effect(
     Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
     """
     clean = np.zeros((n_frames, *shape), np.float32)
-    return _draw(_apply, key, clean, params, exposure_s, sensor_key)
+    return _apply(key, *_prepared(key, clean, params, exposure_s, sensor_key))
 
 
-def _draw(apply, key, clean, params, exposure_s, sensor_key) -> Array:
+def dark_signals(
+    key: RandomKey, n_frames: int, shape: tuple[int, int], params: NoiseModel, *, exposure_s: float | Scalar
+) -> Iterator[tuple[AbstractEffect, Array]]:
+    """What leaves each effect in turn when `sample_dark_by_effect` draws, [frame, row, column]."""
+    clean = np.zeros((n_frames, *shape), np.float32)
+    return _signals(key, *_prepared(key, clean, params, exposure_s, None))
+
+
+def _prepared(key, clean, params, exposure_s, sensor_key):
+    """Checked input: signal [frame, row, column], effects in the precision of the session, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
     dtype = jnp.result_type(float)
@@ -260,18 +270,24 @@ def _draw(apply, key, clean, params, exposure_s, sensor_key) -> Array:
     numbers, rest = eqx.partition(params.effects, eqx.is_inexact_array)
     numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
     effects = eqx.combine(numbers, rest)
-    signal = clean.reshape(-1, *capture.shape)
-    return apply(key, signal, effects, capture).reshape(clean.shape)
+    return clean.reshape(-1, *capture.shape), effects, capture
 
 
 def _apply(key, signal, effects, capture):
+    return reduce(lambda _, step: step[1], _signals(key, signal, effects, capture), signal)
+
+
+def _signals(key, signal, effects, capture):
     scales = [_read_noise_scale(key, effect, capture, signal.shape) for effect in effects if _may_scale(effect)]
     scales = [scale for scale in scales if scale is not None]
     if scales:
         capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
     for effect in effects:
-        signal = _sample_one(key, signal, effect, capture)
-    return signal
+        drawn = _sample_one(key, signal, effect, capture)
+        if np.shape(drawn) != signal.shape:
+            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {signal.shape}.")
+        signal = drawn
+        yield effect, signal
 
 
 _apply_in_one = jax.jit(_apply)

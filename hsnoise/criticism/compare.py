@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise.criticism.reference import measure, misfits, reference
-from hsnoise.draws import check_fits, darks_of
+from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.stack import as_stack
@@ -81,6 +81,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
     darks = darks_of(stack)
+    check_effects(params, darks)
     measured = measure(darks, params)
     own = reference(params, darks, draws, seed, progress or (lambda: None))
     z = own.z(measured.values)

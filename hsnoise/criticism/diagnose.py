@@ -17,13 +17,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise.criticism.candidates import Maker, built_in, given
+from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
 from hsnoise.criticism.reference import measure, reference
-from hsnoise.draws import check_fits, darks_of
+from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
@@ -111,7 +111,8 @@ def diagnose(
         progress: called with no argument after each capture that is drawn.
 
     Raises:
-        TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, or is in the model.
+        TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, is in the model, or
+            returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
     tick = progress or (lambda: None)
     stack = as_stack(stack, **keywords)
@@ -121,6 +122,9 @@ def diagnose(
     check_fits(model, stack)
     own = _own(candidates, model)
     darks = darks_of(stack)
+    check_effects(model, darks)
+    for maker in own.values():
+        check_effects(model.add(made(maker, 1.0, 0)), darks)
     makers = built_in(model, darks) | own
     bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
     null = shrunk(bench.base.own_z(), bench.slopes())
@@ -128,6 +132,11 @@ def diagnose(
         bench.base.z(measure(darks, model).values), null, bench.base.names, bench.base.groups, len(makers)
     )
     prints = [bench.fingerprint(name, maker, AMPLITUDES, DETAILS) for name, maker in makers.items()]
+    for one in prints:
+        if one.name in own and not one.shifts.any():
+            raise ValueError(
+                f"candidates: {one.name} changed no count of {one.shifts[..., 0].size} captures that were drawn"
+            )
     judged = _best_first(judge(of, evidence) for of in prints)
     pair = None
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:

@@ -1,0 +1,69 @@
+"""A user's effect that is wrong is told so by name, before any long work."""
+
+import importlib
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hsnoise
+
+CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
+COUNTS = np.asarray(hsnoise.sample_dark(jax.random.key(0), 8, (32, 48), CAMERA)).reshape(2, 4, 32, 48)
+CAPTURE: dict[str, Any] = {"exposure_s": [0.03, 0.06], "black_level": 64, "cfa": "RGGB", "shutter": "global"}
+
+
+class Mine(hsnoise.AbstractEffect):
+    """Does what `change` does."""
+
+    name: ClassVar[str] = "my_effect"
+    stage: ClassVar[hsnoise.Stage] = hsnoise.Stage.READ
+    change: Callable = eqx.field(static=True)
+
+    def sample(self, signal, capture, *, key):
+        return self.change(signal)
+
+
+FAULTS = {
+    "shape": (lambda signal: signal[:, 1:], r"my_effect: .* returned shape \(\d+, 31, 48\), expected \(\d+, 32, 48\)"),
+    "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
+    "nothing": (lambda signal: None, r"my_effect: .* returned shape \(\)"),
+    "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity for .* of the pixels"),
+    "infinity": (lambda signal: signal.at[:, 3].divide(0.0), "my_effect: .* NaN or infinity"),
+    "unit": (lambda signal: signal + 1e9, r"my_effect: .* signal of 1e\+09 e- .* units that it declares"),
+}
+CALLS = {
+    "compare": lambda effect: hsnoise.compare(CAMERA.add(effect), COUNTS, **CAPTURE),
+    "diagnose": lambda effect: hsnoise.diagnose(CAMERA, COUNTS, candidates=[effect], **CAPTURE),
+    "fit": lambda effect: hsnoise.fit(COUNTS, model=CAMERA.add(effect), **CAPTURE),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_wrong_effect_is_named(call, fault):
+    change, message = FAULTS[fault]
+    with pytest.raises(ValueError, match=message):
+        CALLS[call](Mine(change))
+
+
+def test_sample_names_effect_of_wrong_shape():
+    with pytest.raises(ValueError, match="my_effect: .* returned shape"):
+        hsnoise.sample_dark(jax.random.key(1), 2, (32, 48), CAMERA.add(Mine(FAULTS["shape"][0])))
+
+
+@pytest.mark.parametrize("candidate", [Mine, "row_noise", 3])
+def test_candidate_that_is_no_effect(candidate):
+    with pytest.raises(TypeError, match="candidates: expected effects"):
+        hsnoise.diagnose(CAMERA, COUNTS, candidates=[candidate], **CAPTURE)
+
+
+def test_candidate_that_does_nothing(monkeypatch):
+    module = importlib.import_module("hsnoise.criticism.diagnose")  # the package has the function of that name
+    monkeypatch.setattr(module, "built_in", lambda model, darks: {})
+    with pytest.raises(ValueError, match="my_effect changed no count of 12 captures"):
+        hsnoise.diagnose(CAMERA, COUNTS, candidates=[Mine(lambda signal: signal)], draws=8, **CAPTURE)
