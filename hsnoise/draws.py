@@ -54,11 +54,13 @@ def check_fits(model: NoiseModel, stack: FrameStack) -> None:
 def check_effects(model: NoiseModel, like: FrameStack) -> None:
     """Raise ValueError, naming the effect, if one of them returns another shape, NaN or numbers of another unit.
 
-    One frame of the longest exposure is drawn, effect by effect.
+    The longest exposure is drawn, effect by effect.
     """
+    longest = int(np.argmax(like.exposure_s))
+    frames, exposure_s = like.n_frames[longest], float(like.exposure_s[longest])
     gain = float(np.mean(np.asarray(model["gain"].value))) if "gain" in model else 1.0
     white_dn = 2.0**16 if like.white_level is None else float(like.white_level)
-    for effect, signal in dark_signals(jax.random.key(0), 1, like.shape, model, exposure_s=float(max(like.exposure_s))):
+    for effect, signal in dark_signals(jax.random.key(0), frames, like.shape, model, exposure_s=exposure_s):
         values = np.asarray(signal, float)
         unit, largest = ("e-", white_dn / gain) if effect.stage < Stage.GAIN else ("DN", white_dn)
         bad = ~np.isfinite(values)

@@ -30,7 +30,8 @@ from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
 
 DRAWS = 64
-AMPLITUDES, DETAILS = (0.35, 1.0, 2.5), 4  # draws at each amplitude, each with other details
+GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
+AMPLITUDES, DETAILS, MOST_LIKELY = (0.35, 1.0, 2.5), 4, 10  # and those that are most likely
 CLOSE_DETAILS = 6
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
 MISFIT = 4.5  # normal score of the worst group from which something is there
@@ -125,21 +126,22 @@ def diagnose(
     check_effects(model, darks)
     for maker in own.values():
         check_effects(model.add(made(maker, 1.0, 0)), darks)
-    makers = built_in(model, darks) | own
+    makers = {name: maker for name, maker in built_in(model, darks).items() if name not in own}
     bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
     null = shrunk(bench.base.own_z(), bench.slopes())
     evidence = Evidence(
-        bench.base.z(measure(darks, model).values), null, bench.base.names, bench.base.groups, len(makers)
+        bench.base.z(measure(darks, model).values), null, bench.base.names, bench.base.groups, len(makers) + len(own)
     )
-    prints = [bench.fingerprint(name, maker, AMPLITUDES, DETAILS) for name, maker in makers.items()]
+    prints = bench.fingerprints({name: (maker, AMPLITUDES) for name, maker in own.items()}, DETAILS)
     for one in prints:
-        if one.name in own and not one.shifts.any():
+        if not one.shifts.any():
             raise ValueError(
                 f"candidates: {one.name} changed no count of {one.shifts[..., 0].size} captures that were drawn"
             )
-    judged = _best_first(judge(of, evidence) for of in prints)
+    judged = _looked_at(_best_first(judge(of, evidence) for of in prints), MOST_LIKELY, bench, evidence)
     pair = None
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
+        judged = _looked_at(judged, len(judged), bench, evidence)
         judged = _closer(judged, bench, evidence)
         if judged[0].misfit > MISFIT_LEFT:
             pair = best_pair(judged, evidence)
@@ -157,13 +159,24 @@ def _best_first(judged: Iterable[Judged]) -> list[Judged]:
     return sorted(judged, key=lambda one: -one.score)
 
 
+def _looked_at(judged: list[Judged], at_least: int, bench: Bench, evidence: Evidence) -> list[Judged]:
+    """Candidates, the first of them (`at_least` so many) judged by draws at several amplitudes; best first."""
+    while True:
+        glanced = [one for one in judged[:at_least] if one.of.amplitudes == GLANCE]
+        if not glanced:
+            return judged
+        prints = bench.fingerprints({one.of.name: (one.of.maker, AMPLITUDES) for one in glanced}, DETAILS)
+        again = {of.name: judge(of, evidence) for of in prints}
+        judged = _best_first(again.get(one.of.name, one) for one in judged)
+        at_least = 1
+
+
 def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
     """The leading candidates drawn again close to their amplitudes: fingerprints bend, and strong effects show it."""
-    drawn = []
-    for one in judged[:LEADERS]:
-        around = tuple(CLOSE[[0, 3, -1]] * one.amplitude)
-        again = bench.fingerprint(one.of.name, one.of.maker, around, CLOSE_DETAILS)
-        drawn.append(judge(again, evidence, CLOSE * one.amplitude))
+    leaders = judged[:LEADERS]
+    around = {one.of.name: (one.of.maker, tuple(CLOSE[[0, 3, -1]] * one.amplitude)) for one in leaders}
+    prints = bench.fingerprints(around, CLOSE_DETAILS)
+    drawn = [judge(of, evidence, CLOSE * one.amplitude) for of, one in zip(prints, leaders, strict=True)]
     return _best_first([*drawn, *judged[LEADERS:]])
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +18,8 @@ RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
 SLOPE_DRAWS = 3
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off
 BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
+
+Task = tuple[str, float, int]  # candidate, amplitude, detail
 
 
 @dataclass(frozen=True)
@@ -48,19 +50,42 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Bench:
-    """What every candidate is drawn on: the model, a capture to be like, the draws of the model, where seeds start."""
+    """What every candidate is drawn on: the model, a capture to be like, the draws of the model, where seeds start.
+
+    `drawn` holds shifts [statistic] by candidate, amplitude and detail.
+    """
 
     model: NoiseModel
     darks: FrameStack
     base: Reference
     seed: int
     tick: Callable[[], None]
+    drawn: dict[Task, np.ndarray] = field(default_factory=dict)
 
-    def fingerprint(self, name: str, maker: Maker, amplitudes: tuple[float, ...], details: int) -> Fingerprint:
-        """Draw a candidate on top of the model; the draws share their random numbers with those of the model."""
-        tasks = [(made(maker, amplitude, detail), detail) for amplitude in amplitudes for detail in range(details)]
-        shifts = in_threads(lambda task: self._shift(self.model.add(task[0]), task[1]), tasks, self.tick)
-        return Fingerprint(name, maker, amplitudes, np.stack(shifts).reshape(len(amplitudes), details, -1))
+    def fingerprints(self, wanted: Mapping[str, tuple[Maker, tuple[float, ...]]], details: int) -> list[Fingerprint]:
+        """Draw candidates, by name a maker and amplitudes, on top of the model; each amplitude with several details.
+
+        The draws share their random numbers with those of the model. All are drawn in one go, so that one effect is
+        compiled while another is drawn, and none a second time.
+        """
+        tasks = [
+            (name, amplitude, detail)
+            for detail in range(details)
+            for name, (_, amplitudes) in wanted.items()
+            for amplitude in amplitudes
+        ]
+        new = [task for task in tasks if task not in self.drawn]
+
+        def draw(task: Task) -> np.ndarray:
+            name, amplitude, detail = task
+            return self._shift(self.model.add(made(wanted[name][0], amplitude, detail)), detail)
+
+        self.drawn.update(zip(new, in_threads(draw, new, self.tick), strict=True))
+        prints = []
+        for name, (maker, amplitudes) in wanted.items():
+            shifts = [[self.drawn[name, amplitude, detail] for detail in range(details)] for amplitude in amplitudes]
+            prints.append(Fingerprint(name, maker, amplitudes, np.array(shifts)))
+        return prints
 
     def slopes(self) -> np.ndarray:
         """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
@@ -78,17 +103,17 @@ class Bench:
 def _moved_models(model: NoiseModel) -> list[NoiseModel]:
     """The model with one base parameter a little off, for each of them."""
     models = []
-    for name, field in BASE.items():
+    for name, what in BASE.items():
         if name not in model:
             continue
-        value = np.asarray(getattr(model[name], field), float)
+        value = np.asarray(getattr(model[name], what), float)
         # A black level is off by a share of the noise, not of itself.
         noise_dn = float(np.mean(np.asarray(model["gain"].value))) * float(model["read_noise"].sigma)
         steps = np.full(value.shape, 0.5 * STEP * noise_dn) if name == "black_level" else STEP * value
         for i in np.ndindex(value.shape):
             changed = value.copy()
             changed[i] += steps[i]
-            models.append(model.with_value(name, field, changed))
+            models.append(model.with_value(name, what, changed))
     if "row_gain" in model and model.shutter == "rolling":
         models.append(model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05))
     return models

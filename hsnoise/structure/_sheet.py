@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -46,7 +47,8 @@ class Sheet:
 
     def add(self, group: str, what: str, values: np.ndarray | float, error: float) -> None:
         """The mean of `values` over whatever axes they have; `error` is that of the mean."""
-        self.entries[group, what] = Entry(float(np.mean(values)), float(error))
+        values = np.asarray(values, np.float64)
+        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error))
 
     def add_count(self, group: str, what: str, number: float) -> None:
         self.entries[group, what] = Entry(float(number), 0.5, is_count=True)
@@ -68,11 +70,10 @@ def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
     out = {}
     for group, what in keys:
         found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
-        values = np.array([entry.value for entry in found])
+        total = sum(entry.value for entry in found)
         if found[0].is_count:
-            entry = Entry(float(np.sqrt(values.sum())), 0.5)
+            entry = Entry(math.sqrt(total), 0.5)
         else:
-            errors = np.array([entry.error for entry in found])
-            entry = Entry(float(values.mean()), float(np.sqrt((errors**2).sum()) / len(found)))
+            entry = Entry(total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found))
         out[group, f"{what}, {half}"] = entry
     return out

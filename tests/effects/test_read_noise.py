@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 from hsnoise.effects import HeavyTailedReadNoise, RandomTelegraphNoise, ReadNoise, ReadNoiseNonuniformity
+from hsnoise.effects.heavy_tailed_read_noise import LARGEST_LOGIT, log_quantiles
 from hsnoise.model import NoiseModel, sample_dark
 
 KEY = jax.random.key(37)
@@ -28,6 +30,15 @@ def test_heavy_tails_are_students_t_of_the_same_sigma(dof):
     if dof > 4:
         squares = drawn**2
         assert abs(squares.mean() - 9) < 5 * squares.std() / np.sqrt(squares.size)
+
+
+@pytest.mark.parametrize("dof", [2.05, 2.5, 3.0, 5.0, 20.0, 500.0, 1e4, 1e6])
+def test_quantiles_of_the_variance_are_those_of_chi_square(dof):
+    table = np.asarray(log_quantiles(jnp.float32(dof / 2)), float)
+    logit = np.linspace(-LARGEST_LOGIT, LARGEST_LOGIT, len(table))
+    below, above = stats.gamma.ppf(1 / (1 + np.exp(-logit)), dof / 2), stats.gamma.isf(1 / (1 + np.exp(logit)), dof / 2)
+    np.testing.assert_allclose(table, np.log(np.where(logit < 0, below, above)), atol=3e-4)
+    assert np.isfinite(jax.grad(lambda a: log_quantiles(a).sum())(jnp.float32(dof / 2)))
 
 
 def test_heavy_tails_are_independent_of_pixel_and_frame():
