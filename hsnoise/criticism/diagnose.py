@@ -129,16 +129,9 @@ def diagnose(
     makers = {name: maker for name, maker in built_in(model, darks).items() if name not in own}
     bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
     null = shrunk(bench.base.own_z(), bench.slopes())
-    evidence = Evidence(
-        bench.base.z(measure(darks, model).values), null, bench.base.names, bench.base.groups, len(makers) + len(own)
-    )
-    prints = bench.fingerprints({name: (maker, AMPLITUDES) for name, maker in own.items()}, DETAILS)
-    for one in prints:
-        if not one.shifts.any():
-            raise ValueError(
-                f"candidates: {one.name} changed no count of {one.shifts[..., 0].size} captures that were drawn"
-            )
-    judged = _looked_at(_best_first(judge(of, evidence) for of in prints), MOST_LIKELY, bench, evidence)
+    z = bench.base.z(measure(darks, model).values)
+    evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
+    judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
     pair = None
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
         judged = _looked_at(judged, len(judged), bench, evidence)
@@ -157,6 +150,17 @@ def diagnose(
 
 def _best_first(judged: Iterable[Judged]) -> list[Judged]:
     return sorted(judged, key=lambda one: -one.score)
+
+
+def _glance(makers: dict[str, Maker], own: dict[str, Maker], bench: Bench, evidence: Evidence) -> list[Judged]:
+    """All candidates, judged by a few draws, the user's own by many; best first."""
+    prints = bench.fingerprints({name: (maker, AMPLITUDES) for name, maker in own.items()}, DETAILS)
+    for one in prints:
+        if not one.shifts.any():
+            drawn = one.shifts[..., 0].size
+            raise ValueError(f"candidates: {one.name} changed no count of {drawn} captures that were drawn")
+    prints += bench.fingerprints({name: (maker, GLANCE) for name, maker in makers.items()}, GLANCE_DETAILS)
+    return _best_first(judge(of, evidence) for of in prints)
 
 
 def _looked_at(judged: list[Judged], at_least: int, bench: Bench, evidence: Evidence) -> list[Judged]:
