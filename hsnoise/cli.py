@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import itertools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -137,8 +138,8 @@ def _compare(args: argparse.Namespace) -> None:
     _check_outputs(args)
     model, stack = _model(args.model), _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    with _busy("Drawing from the model"):
-        found = hsnoise.compare(model, stack, seed=args.seed)
+    with _busy("Drawing from the model") as say:
+        found = hsnoise.compare(model, stack, seed=args.seed, progress=_counter(say, "Captures drawn from the model"))
     _show(found, args.out / "comparison.png")
     _write_report(args, found, stack, fit=model)
 
@@ -148,8 +149,9 @@ def _diagnose(args: argparse.Namespace) -> None:
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = _fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
-    with _busy("Drawing every effect that may be missing"):
-        found = hsnoise.diagnose(fitted, stack, seed=args.seed)
+    with _busy("Drawing every effect that may be missing") as say:
+        tick = _counter(say, "Captures drawn with effects that may be missing")
+        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=tick)
     _show(found, args.out / "ranking.png")
     if args.report is not None:
         with _busy("Comparing with the model's own samples"):
@@ -259,6 +261,11 @@ def _busy(text: str) -> Iterator[Callable[[str], None]]:
         yield lambda sentence: progress.update(task, description=sentence)
 
 
+def _counter(say: Callable[[str], None], text: str) -> Callable[[], None]:
+    numbers = itertools.count(1)
+    return lambda: say(f"{text}: {next(numbers)}")
+
+
 def _show(found, path: Path) -> None:
     """Print a finding and draw its figure."""
     print(found)
@@ -294,15 +301,17 @@ def _one_or_list(numbers: list[float] | None) -> Any:
 
 
 def _draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray, seed: int) -> np.ndarray:
-    """Counts `[exposure, frame, row, column]`, frame by frame so that memory holds one."""
+    """Counts `[exposure, frame, row, column]`, frame by frame unless what happens in one depends on those before."""
     key = jax.random.key(seed)
-    tasks = [(e, f) for e in range(len(exposures_s)) for f in range(n_frames)]
+    at_once = n_frames if any(effect.in_series for effect in model) else 1
+    tasks = [(e, f) for e in range(len(exposures_s)) for f in range(0, n_frames, at_once)]
+    clean = np.broadcast_to(clean, (at_once, *clean.shape))
     console = Console(stderr=True)
     frames = []
     for e, f in track(tasks, "Drawing frames", console=console, transient=True, disable=not console.is_terminal):
-        frame_key = jax.random.fold_in(jax.random.fold_in(key, e), f)
-        frames.append(np.asarray(hsnoise.sample(frame_key, clean, model, exposure_s=exposures_s[e], sensor_key=key)))
-    counts = np.stack(frames).reshape(len(exposures_s), n_frames, *clean.shape)
+        own = jax.random.fold_in(jax.random.fold_in(key, e), f)
+        frames.append(np.asarray(hsnoise.sample(own, clean, model, exposure_s=exposures_s[e], sensor_key=key)))
+    counts = np.stack(frames).reshape(len(exposures_s), n_frames, *clean.shape[1:])
     return counts.astype(np.uint16) if counts.max() <= np.iinfo(np.uint16).max else counts
 
 

@@ -137,6 +137,15 @@ def test_every_format_reads_back(suffix, tmp_path):
     assert not np.array_equal(frames[0], frames[1])
 
 
+def test_frames_of_one_exposure_follow_each_other(tmp_path):
+    model, out = tmp_path / "model.json", tmp_path / "darks.npz"
+    hsnoise.cameras.grasshopper3().add(hsnoise.effects.DarkCurrentDrift(200.0)).save(model)
+    arguments = ["--frames", "4", "--shape", "64x64", "--exposure", "0.1", "--out", str(out)]
+    assert main(["sample", str(model), *arguments]) == 0
+    means = [frame.mean() for frame in hsnoise.load(out).frames(0)]
+    assert all(later > earlier + 10 for earlier, later in zip(means, means[1:], strict=False))
+
+
 @pytest.mark.parametrize("colour", [False, True], ids=["mosaic", "R, G, B"])
 def test_clean_image_is_scaled_and_keeps_its_colours(colour, tmp_path):
     rows, columns = 32, 48

@@ -18,7 +18,7 @@ An effect of one's own is a class of about 20 lines in one's own file:
 import abc
 import dataclasses
 import enum
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -170,10 +170,12 @@ class AbstractEffect(eqx.Module):
     Attributes:
         name: name in tables and files, unique in a model; the effect's random key derives from it.
         stage: where in the sensor it acts.
+        in_series: whether what happens in a frame depends on those before it, or on how many there were.
     """
 
     name: eqx.AbstractClassVar[str]
     stage: eqx.AbstractClassVar[Stage]
+    in_series: ClassVar[bool] = False
 
     @abc.abstractmethod
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:

@@ -25,6 +25,7 @@ class DarkCurrentDrift(AbstractEffect):
 
     name: ClassVar[str] = "dark_current_drift"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    in_series: ClassVar[bool] = True
     slope: Scalar = param("e-/s/frame", low=0, doc="growth of the dark current from one frame to the next")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

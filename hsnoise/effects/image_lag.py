@@ -25,6 +25,7 @@ class ImageLag(AbstractEffect):
 
     name: ClassVar[str] = "image_lag"
     stage: ClassVar[Stage] = Stage.COUPLING
+    in_series: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="part of the electrons that stays for the next frame")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

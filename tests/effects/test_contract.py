@@ -134,6 +134,16 @@ def test_no_effect_imports_another():
 
 
 @each_effect
+def test_frames_depend_on_those_before_only_in_series(effect):
+    light = signal()
+    brighter = np.concatenate([light[:1] + 30.0, light[1:]])
+    draws = [np.asarray(sample(KEY, clean, model_of(effect))) for clean in (light, brighter)]
+    assert effect.in_series or np.array_equal(draws[0][1], draws[1][1])
+    if isinstance(effect, ImageLag):
+        assert not np.array_equal(draws[0][1], draws[1][1])
+
+
+@each_effect
 def test_effect_is_final(effect):
     assert type(effect).__mro__[1] is AbstractEffect
     assert not inspect.isabstract(type(effect))
