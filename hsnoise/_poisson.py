@@ -1,4 +1,7 @@
-"""Poisson draws by inversion of one uniform number a pixel: no rejection, so that pixels run side by side.
+"""Poisson and normal numbers by inversion of one uniform number a pixel: no rejection, so that pixels run side by side.
+
+A pixel has two words of random bits, one block of Threefry (Salmon et al., "Parallel random numbers: as easy as 1, 2,
+3", SC 2011), which counts frames and pixels: they are the same however frames are batched or spread over devices.
 
 Below SUM_BELOW electrons the distribution function is summed up, unrolled. Above, its inverse is a normal quantile put
 through Temme's uniform expansion (Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution
@@ -7,13 +10,17 @@ function", ACM Trans. Math. Softw. 42, 2016), whose polynomials these are.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtri
+import numpy as np
 
-SUM_BELOW, SUM_TERMS, SUM_LEAST = 12.0, 44, 1e-9
+Regime = Literal["few", "many", "any"]  # what is known of means: all below SUM_BELOW, none, nothing
+ROTATIONS, PARITY = ((13, 15, 26, 6), (17, 29, 16, 24)), np.uint32(0x1BD11BDA)
+
+SUM_BELOW, SUM_TERMS, SUM_LEAST = 12.0, 44, 2.0**-24
 CENTRAL_FROM = -0.6833501
-NEWTON_STEPS = 4
 
 # Highest order first: r(s) = 1 + s + s^2 RATIO(s); the terms of order 1 and 1 / mean, by r - 1.
 RATIO = (
@@ -28,50 +35,101 @@ ORDER_INVERSE = (
     -0.00014585224, 0.00146121529, -0.00610328845, 0.0138117964, -0.0186988746, 0.0168155118, -0.013394797,
     0.0135698573, -0.0155377333, 0.0174065334, -0.0198011178,
 )  # fmt: skip
+# Left of CENTRAL_FROM, by log(s + sqrt 2): log r, and the term of order 1. Fitted to r from 0.001 to 0.42, within 4e-6.
+TAIL_LOG_R = (
+    -2.03070433e-06, -4.23689591e-05, -0.000252537775, 0.00158847161, 0.0391188573, 1.38670517, -0.48531177,
+)  # fmt: skip
+TAIL_ORDER_ONE = (
+    1.1333683e-06, 2.6133948e-05, 0.000231090147, 0.000726764001, -0.00297024906, -0.0373529641, 0.346639863,
+)  # fmt: skip
+TAIL_LEAST, TAIL_MOST = 0.0056, 0.75
+# Giles, "Approximating the erfinv function", GPU Computing Gems 2, 2011: by w - 2.5, and by sqrt(w) - 3 from w = 5.
+ERFINV_CENTRE = (
+    2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
+    0.246640727, 1.50140941,
+)  # fmt: skip
+ERFINV_TAIL = (
+    -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
+    1.00167406, 2.83297682,
+)  # fmt: skip
 
 
-def poisson(key: jax.Array, mean: jax.Array) -> jax.Array:
-    """Poisson counts of the given means, float32, the shape of `mean`. A negative or NaN mean gives 0."""
-    bits = jax.random.bits(key, mean.shape, jnp.uint32)
-    return poisson_of_bits(bits >> 9, mean.astype(jnp.float32))
+def pixel_words(key: jax.Array, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+    """Two random words (uint32) for each pixel of `shape` (frames, rows, columns): Threefry-2x32 of 20 rounds."""
+    first, second = jax.random.bits(key, (2,), jnp.uint32)
+    keys = (first, second, first ^ second ^ PARITY)
+    frame, row, column = (jax.lax.broadcasted_iota(jnp.uint32, shape, axis) for axis in range(3))
+    a, b = frame + keys[0], row * np.uint32(shape[2]) + column + keys[1]
+    for i in range(5):
+        for rotation in ROTATIONS[i % 2]:
+            a = a + b
+            b = a ^ ((b << np.uint32(rotation)) | (b >> np.uint32(32 - rotation)))
+        a, b = a + keys[(i + 1) % 3], b + keys[(i + 2) % 3] + np.uint32(i + 1)
+    return a, b
 
 
-def poisson_of_bits(cell: jax.Array, mean: jax.Array) -> jax.Array:
-    """The count for `cell`, one of the 2^23 equal cells into which the unit interval is cut."""
+def regime_of(low: float, high: float) -> Regime:
+    """The regime of means between `low` and `high`."""
+    return "few" if high < SUM_BELOW else "many" if low >= SUM_BELOW else "any"
+
+
+def poisson_of_bits(bits: jax.Array, mean: jax.Array, regime: Regime = "any") -> jax.Array:
+    """Poisson counts, float32, from random bits (uint32) of the pixels and their mean, or one for all.
+
+    The first 23 bits choose one of the equal cells into which the unit interval is cut.
+    """
+    uniform, mean = _middle_of_cell(bits), mean.astype(jnp.float32)
+    if regime == "few":
+        count = _by_sum(uniform, mean)
+    elif regime == "many":
+        count = _by_normal(uniform, mean)
+    else:
+        few = _by_sum(uniform, jnp.minimum(mean, SUM_BELOW))
+        count = jnp.where(mean < SUM_BELOW, few, _by_normal(uniform, jnp.maximum(mean, SUM_BELOW)))
+    return jnp.where(mean > 0, count, 0.0)
+
+
+def normal_of_bits(bits: jax.Array) -> jax.Array:
+    """Standard normal numbers, float32, from random bits (uint32), by the first 23 of them."""
+    return _normal_quantile(_middle_of_cell(bits))
+
+
+def _middle_of_cell(bits: jax.Array) -> jax.Array:
     # 23 bits and the middle of the cell are exact in float32, and never 0 or 1.
-    uniform = (cell.astype(jnp.float32) + 0.5) * jnp.float32(2.0**-23)
-    few = _by_sum(uniform, jnp.minimum(mean, SUM_BELOW))
-    many = _by_normal(uniform, jnp.maximum(mean, SUM_BELOW))
-    return jnp.where(mean > 0, jnp.where(mean < SUM_BELOW, few, many), 0.0)
+    return ((bits >> 9).astype(jnp.float32) + 0.5) * jnp.float32(2.0**-23)
+
+
+def _normal_quantile(uniform):
+    # 1 - x^2 of erfinv's argument x = 2 u - 1, without the cancellation in the tails
+    w = -jnp.log(4 * uniform * (1 - uniform))
+    tail = jnp.sqrt(jnp.maximum(w, 5.0)) - 3
+    factor = jnp.where(w < 5, _polynomial(ERFINV_CENTRE, w - 2.5), _polynomial(ERFINV_TAIL, tail))
+    return factor * jnp.float32(2**0.5) * (2 * uniform - 1)
 
 
 def _by_sum(uniform, mean):
     term = jnp.exp(-mean)
-    below, count = term, jnp.zeros_like(mean)
+    below, count = term, jnp.zeros_like(uniform)
     for k in range(1, SUM_TERMS + 1):
-        # The sum may stop short of a uniform number next to 1; counting ends where terms no longer matter.
-        count = count + ((uniform > below) & ((term > SUM_LEAST) | (mean > k))).astype(mean.dtype)
-        term = term * (mean / k)
-        below = below + term
+        count = count + (uniform > below).astype(count.dtype)
+        term = term * (mean * jnp.float32(1 / k))
+        # Rounded sums may stop short of a uniform number next to 1: steps of its spacing end the counting.
+        below = below + jnp.maximum(term, SUM_LEAST)
     return count
 
 
 def _by_normal(uniform, mean):
-    s = ndtri(uniform) / jnp.sqrt(mean)
+    s = _normal_quantile(uniform) / jnp.sqrt(mean)
     excess = s + s * s * _polynomial(RATIO, s)
     central = _polynomial(ORDER_ONE, excess) + _polynomial(ORDER_INVERSE, excess) / mean + mean * excess
     return jnp.floor(jnp.maximum(mean + jnp.where(s > CENTRAL_FROM, central, _lower_tail(s, mean) - mean), 0.0))
 
 
 def _lower_tail(s, mean):
-    """Left of where the polynomials hold: r from r log r - r + 1 = s^2 / 2 by Newton's method, from the left."""
-    half_square = jnp.minimum(0.5 * s * s, 1.0 - 1e-6)
-    r = jnp.full_like(s, 1e-3)
-    for _ in range(NEWTON_STEPS):
-        log_r = jnp.log(r)
-        r = jnp.clip(r - (r * log_r - r + 1 - half_square) / log_r, 1e-7, 0.45)
-    order_one = jnp.log(-s * jnp.sqrt(r) / (1 - r)) / jnp.log(r)
-    return mean * r + order_one - 0.0218 / (mean * r + 0.065 * mean)
+    """Left of where the polynomials hold."""
+    place = jnp.log(jnp.clip(s + jnp.float32(2**0.5), TAIL_LEAST, TAIL_MOST))
+    most = mean * jnp.exp(_polynomial(TAIL_LOG_R, place))
+    return most + _polynomial(TAIL_ORDER_ONE, place) - 0.0218 / (most + 0.065 * mean)
 
 
 def _polynomial(coefficients, x):

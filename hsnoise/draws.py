@@ -84,8 +84,6 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
     """Darks drawn from `model` as `like` was taken: one sensor, every frame new."""
     key = jax.random.key(seed)
     sensor_key = named_key(key, "sensor")
-    if "shot_noise" in model:
-        model = model.remove("shot_noise")  # there is no light, and drawing it takes time
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
         own = jax.random.fold_in(named_key(key, "frames"), e)

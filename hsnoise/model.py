@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial, reduce
@@ -19,11 +20,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
+from hsnoise._poisson import Regime, regime_of
 from hsnoise._types import RandomKey, Scalar, cfa_tile, channels_of, check_shutter, is_traced
-from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter
-from hsnoise.effects._base import shortest
+from hsnoise.arrivals import Arrivals, merged
+from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
 
 FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 
@@ -138,7 +141,7 @@ class NoiseModel(eqx.Module):
             "shutter": self.shutter,
             "exposure_s": self.exposure_s,
             "precision": str(jnp.result_type(*leaves)) if leaves else "float32",
-            "effects": [_effect_to_json(effect, self.channels) for effect in self.effects],
+            "effects": [effect_to_json(effect, self.channels) for effect in self.effects],
         }
         write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
@@ -169,7 +172,7 @@ class NoiseModel(eqx.Module):
             with jax.enable_x64(content["precision"] == "float64"):
                 channels = channels_of(content["cfa"])
                 return NoiseModel(
-                    [_effect_from_json(item, classes, channels) for item in content["effects"]],
+                    [effect_from_json(item, classes, channels) for item in content["effects"]],
                     **{field: content[field] for field in ("cfa", "shutter", "exposure_s")},
                 )
         except KeyError as error:
@@ -185,6 +188,7 @@ def sample(
     *,
     exposure_s: float | Scalar | None = None,
     sensor_key: RandomKey | None = None,
+    differentiable: bool = False,
 ) -> Array:
     """Draw what the sensor makes of a clean image: counts in DN.
 
@@ -199,11 +203,13 @@ def sample(
         exposure_s: exposure in seconds; that of the model by default.
         sensor_key: key from which fixed patterns are drawn; the same key is the same sensor. By default derived
             from `key`, so that each call is another sensor of the same make.
+        differentiable: the same counts as floats, with derivatives by `clean` and the parameters. Clipping stops
+            them, rounding does not. The derivatives by light and dark current need read noise, with nothing but
+            effects that add electrons before it.
 
     Returns:
         Counts, the shape of `clean`: uint16 if the model's white level is at most 65535 DN, else uint32.
-        Without the `adc` effect (`params.remove("adc")`): DN as floats, neither rounded nor clipped, which
-        has gradients by the parameters of Gaussian and multiplicative effects.
+        Without the `adc` effect (`params.remove("adc")`): DN as floats, neither rounded nor clipped.
 
     Raises:
         TypeError: if `params` is no NoiseModel or `clean` does not hold real numbers.
@@ -214,8 +220,9 @@ def sample(
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
     """
-    signal, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
-    return _apply_in_one(key, signal, effects, capture).reshape(np.shape(clean))
+    light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
+    capture = dataclasses.replace(capture, differentiable=differentiable)
+    return _apply_in_one(key, light, shape, effects, capture).reshape(np.shape(clean))
 
 
 def sample_dark(
@@ -258,39 +265,54 @@ def dark_signals(
 
 
 def _prepared(key, clean, params, exposure_s, sensor_key):
-    """Checked input: signal [frame, row, column], effects in the precision of the session, capture."""
+    """Checked input: photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
     dtype = jnp.result_type(float)
-    clean = jnp.asarray(_check_clean(clean, params.cfa), dtype)
+    clean, low, high = _check_clean(clean, params.cfa)
     exposure = _check_exposure(params.exposure_s if exposure_s is None else exposure_s)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
     capture = Capture(jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter, sensor_key)
+    effects = merged(params.effects, _regime(low, high, params, exposure))
     # A fit returns float64 parameters, whatever precision the session samples in.
-    numbers, rest = eqx.partition(params.effects, eqx.is_inexact_array)
+    numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
     numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
-    effects = eqx.combine(numbers, rest)
-    return clean.reshape(-1, *capture.shape), effects, capture
+    shape = (math.prod(clean.shape[:-2]), *capture.shape)
+    light = jnp.asarray(low, dtype) if low == high else jnp.asarray(clean, dtype).reshape(shape)
+    return light, shape, eqx.combine(numbers, rest), capture
 
 
-def _apply(key, signal, effects, capture):
-    return reduce(lambda _, step: step[1], _signals(key, signal, effects, capture), signal)
+def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
+    """What is known of the mean electrons where light, between `low` and `high`, has not been changed before."""
+    rate = params["dark_current"].rate if "dark_current" in params else 0.0
+    changed = any(effect.stage < Stage.PHOTONS for effect in params)
+    if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
+        return "any"
+    dark = float(rate) * float(exposure_s)
+    return regime_of(low + dark, high + dark)
 
 
-def _signals(key, signal, effects, capture):
-    scales = [_read_noise_scale(key, effect, capture, signal.shape) for effect in effects if _may_scale(effect)]
+def _apply(key, light, shape, effects, capture):
+    return reduce(
+        lambda _, step: step[1], _signals(key, light, shape, effects, capture), jnp.broadcast_to(light, shape)
+    )
+
+
+def _signals(key, light, shape, effects, capture):
+    scales = [_read_noise_scale(key, effect, capture, shape) for effect in effects if _may_scale(effect)]
     scales = [scale for scale in scales if scale is not None]
     if scales:
         capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
+    signal = light
     for effect in effects:
-        drawn = _sample_one(key, signal, effect, capture)
-        if np.shape(drawn) != signal.shape:
-            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {signal.shape}.")
+        drawn = _sample_one(key, signal, shape, effect, capture)
+        if np.shape(drawn) != shape:
+            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
         signal = drawn
         yield effect, signal
 
 
-_apply_in_one = jax.jit(_apply)
+_apply_in_one = partial(jax.jit, static_argnums=2)(_apply)
 
 
 def _may_scale(effect: AbstractEffect) -> bool:
@@ -302,12 +324,16 @@ def _read_noise_scale(key, effect, capture, shape):
     return effect.read_noise_scale(capture, shape, key=named_key(key, effect.name))
 
 
-@jax.jit
-def _sample_one(key, signal, effect, capture):
-    return effect.sample(signal, capture, key=named_key(key, effect.name))
+@partial(jax.jit, static_argnums=2)
+def _sample_one(key, signal, shape, effect, capture):
+    own = named_key(key, effect.stream or effect.name)
+    if isinstance(effect, Arrivals):
+        return effect.expose(signal, shape, capture, key=own)
+    return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)
 
 
 def _check_clean(clean, cfa: str):
+    """The array, and its lowest and highest value; NaN if it is traced."""
     clean = clean if isinstance(clean, jax.Array) else np.asarray(clean)
     if not (jnp.issubdtype(clean.dtype, jnp.integer) or jnp.issubdtype(clean.dtype, jnp.floating)):
         raise TypeError(f"clean: expected real numbers (photoelectrons), got dtype {clean.dtype}.")
@@ -316,12 +342,13 @@ def _check_clean(clean, cfa: str):
     period = len(cfa_tile(cfa))
     if clean.shape[-2] % period or clean.shape[-1] % period:
         raise ValueError(f"clean: expected even rows and columns for cfa {cfa}, got {clean.shape[-2:]}.")
-    if not is_traced(clean):
-        with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
-            low, high = float(clean.min()), float(clean.max())
-        if not (low >= 0 and high < np.inf):
-            raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
-    return clean
+    if is_traced(clean):
+        return clean, np.nan, np.nan
+    with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
+        low, high = float(clean.min()), float(clean.max())
+    if not (low >= 0 and high < np.inf):
+        raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
+    return clean, low, high
 
 
 def _check_exposure(exposure_s):
@@ -345,33 +372,6 @@ def _fit_to_channels(effect: AbstractEffect, channels: tuple[str, ...]) -> Abstr
         spread = jnp.broadcast_to(value, shape)
         effect = eqx.tree_at(attrgetter(field), effect, spread)
     return effect
-
-
-def _effect_to_json(effect: AbstractEffect, channels: tuple[str, ...]) -> dict[str, Any]:
-    parameters = {}
-    for field, spec in effect.specs().items():
-        leaf = np.asarray(getattr(effect, field))
-        value = dict(zip(channels, map(shortest, leaf), strict=True)) if spec.per_channel else shortest(leaf)
-        parameters[field] = {"value": value, "unit": spec.unit}
-    return {"name": effect.name, "parameters": parameters, "settings": effect.settings()}
-
-
-def _effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]], channels: tuple[str, ...]):
-    name = item["name"]
-    if name not in classes:
-        raise ValueError(
-            f"effect {name!r} is not built into hsnoise; pass its class: NoiseModel.load(path, effects=[MyEffect])."
-        )
-    specs = classes[name].specs()
-    if set(item["parameters"]) != set(specs):
-        raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(item['parameters'])}.")
-    values = {}
-    for field, spec in specs.items():
-        value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
-        if unit != spec.unit:
-            raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")
-        values[field] = np.array([value[channel] for channel in channels]) if spec.per_channel else value
-    return classes[name](**values, **item["settings"])
 
 
 def _version() -> str:

@@ -188,13 +188,14 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     scale, weight = _weights(problem, y, tick)
     prior = np.concatenate([np.full(n, 1e-6), np.full(len(problem.knobs), PRIOR_SIGMA**-2)])
     for _ in range(ITERATIONS):
-        mean, slopes = _mean_and_slopes(problem, y, tick)
-        residual, slopes = (measured - mean) / scale, slopes / scale[:, None]
+        drawn, slopes = _draws_and_slopes(problem, y, tick)
+        mean, slopes = drawn.mean(0), slopes / scale[:, None]
         information = slopes.T @ weight @ slopes + np.diag(prior)
-        step = np.linalg.solve(information, slopes.T @ weight @ residual - prior * (y - problem.start))
+        gain = slopes.T @ weight
+        step = np.linalg.solve(information, gain @ ((measured - mean) / scale) - prior * (y - problem.start))
         longest = np.abs(step[n:]).max(initial=0.0)
         y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
-    covariance = np.linalg.inv(information)
+    covariance = _as_scattered(np.linalg.inv(information), gain, (drawn - mean) / scale)
     return _result(problem, y, covariance, float(np.abs(step / np.sqrt(np.diagonal(covariance))).max()))
 
 
@@ -218,10 +219,23 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     )
 
 
+def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """`covariance` [number, number], widened if estimates from draws that the weights have not seen scatter more.
+
+    gain [number, statistic] leads from statistics to the score; z [draw, statistic] are draws about their mean.
+    """
+    estimates = z @ (covariance @ gain).T
+    scatter = (estimates**2).sum(0) / (len(z) - 1)
+    # Few draws: what they say of one number is averaged with what they say of all.
+    ratio = scatter / np.diagonal(covariance)
+    factor = np.sqrt(np.maximum(0.5 * (ratio + ratio.mean()), 1.0))
+    return covariance * factor[:, None] * factor[None, :]
+
+
 def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """`covariance`, widened where it claims to know base parameters better than the likelihood did without the effects.
 
-    Weights from a few dozen draws fit those draws too well; the effects' own errors are widened by as much.
+    The effects' own errors are widened by as much.
     """
     n = len(base)
     growth = np.sqrt(np.maximum(np.diagonal(base) / np.diagonal(covariance)[:n], 1.0))
@@ -245,7 +259,8 @@ def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:
 
 def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
     """Deviation [statistic] and inverse correlation of the statistics, the noise of simulated means included."""
-    drawn = in_threads(lambda i: problem.draw(y, i), range(COVARIANCE_DRAWS), tick)
+    # Of other seeds than the means, which tell how far estimates scatter.
+    drawn = in_threads(lambda i: problem.draw(y, MEAN_DRAWS + i), range(COVARIANCE_DRAWS), tick)
     values, floor = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0)
     n = len(values)
     variance = floored_variance(values.var(0, ddof=1), n - 1, floor**2)
@@ -257,8 +272,8 @@ def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndar
     return scale, np.linalg.inv((1 - share) * correlation + share * np.eye(len(scale)) + 0.02 * np.eye(len(scale)))
 
 
-def _mean_and_slopes(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
-    """Expected statistics at y, and their derivatives [statistic, number] by common random numbers."""
+def _draws_and_slopes(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
+    """Statistics of draws at y [draw, statistic]; their derivatives [statistic, number] by common random numbers."""
     base = [v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)]
     steps = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
 
@@ -270,4 +285,4 @@ def _mean_and_slopes(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray,
 
     tasks = [(which, number) for which in range(len(y)) for number in range(SLOPE_DRAWS)]
     slopes = np.stack(in_threads(difference, tasks, tick)).reshape(len(y), SLOPE_DRAWS, -1)
-    return np.mean(base, axis=0), slopes.mean(1).T
+    return np.stack(base), slopes.mean(1).T

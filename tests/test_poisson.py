@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise._poisson import poisson, poisson_of_bits
+from hsnoise._poisson import normal_of_bits, pixel_words, poisson_of_bits
 
 CELLS = 2**23
+
+
+def poisson(key, mean):
+    return poisson_of_bits(jax.random.bits(key, mean.shape, jnp.uint32), mean)
 
 
 @pytest.mark.parametrize(
@@ -18,13 +22,20 @@ CELLS = 2**23
     [(1e-4, 1e-6), (0.3, 1e-6), (3.0, 1e-6), (11.99, 2e-6), (12.01, 3e-5), (20.0, 1e-5), (60.0, 1e-5), (1000.0, 2e-5)],
 )
 def test_all_uniform_numbers_give_the_law(mean, distance):
-    counts = np.asarray(jax.jit(poisson_of_bits)(jnp.arange(CELLS, dtype=jnp.uint32), jnp.full(CELLS, mean)))
+    bits = jnp.arange(CELLS, dtype=jnp.uint32) << 9
+    counts = np.asarray(jax.jit(poisson_of_bits)(bits, jnp.full(CELLS, mean)))
+    np.testing.assert_array_equal(jax.jit(poisson_of_bits)(bits, jnp.float32(mean)), counts)
     assert np.all(np.diff(counts) >= 0)
     drawn = np.bincount(counts.astype(int)) / CELLS
     law = stats.poisson.pmf(np.arange(len(drawn)), np.float32(mean))
     assert 0.5 * (np.abs(drawn - law).sum() + 1 - law.sum()) < distance
     # No uniform number runs to the end of a sum or a tail that ought not be reached.
     assert stats.poisson.sf(counts.max() - 1, mean) > 1e-9
+
+
+def test_all_uniform_numbers_give_the_normal_law():
+    drawn = np.asarray(jax.jit(normal_of_bits)(jnp.arange(CELLS, dtype=jnp.uint32) << 9))
+    np.testing.assert_allclose(drawn, stats.norm.ppf((np.arange(CELLS) + 0.5) / CELLS), rtol=3e-6, atol=3e-7)
 
 
 @pytest.mark.parametrize("mean", [1e5, 1e6])
@@ -44,3 +55,28 @@ def test_means_differ_from_pixel_to_pixel():
 
 def test_no_light_gives_no_electrons():
     assert not np.any(poisson(jax.random.key(3), jnp.zeros((64, 64))))
+
+
+def test_words_are_those_of_threefry():
+    """JAX's 32 random bits are both words of a block, one xor the other."""
+    key = jax.random.key(4)
+    first, second = pixel_words(key, (1, 8, 16))
+    own = jax.random.wrap_key_data(jax.random.bits(key, (2,), jnp.uint32))
+    with jax.threefry_partitionable(True):
+        np.testing.assert_array_equal(first ^ second, jax.random.bits(own, (1, 8, 16), jnp.uint32))
+
+
+def test_words_count_frames_and_pixels():
+    key = jax.random.key(5)
+    some, more = pixel_words(key, (2, 6, 8)), pixel_words(key, (5, 6, 8))
+    for word, longer in zip(some, more, strict=True):
+        np.testing.assert_array_equal(word, longer[:2])
+        assert len(np.unique(longer)) == longer.size
+
+
+@pytest.mark.parametrize(("mean", "regime"), [(3.0, "few"), (11.9, "few"), (12.0, "many"), (400.0, "many")])
+def test_regimes_agree(mean, regime):
+    bits = jax.random.bits(jax.random.key(6), (200_000,), jnp.uint32)
+    np.testing.assert_array_equal(
+        poisson_of_bits(bits, jnp.float32(mean), regime), poisson_of_bits(bits, jnp.float32(mean))
+    )

@@ -24,10 +24,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaincc
 
 from hsnoise._keys import named_key
-from hsnoise._poisson import poisson
+from hsnoise._poisson import normal_of_bits, pixel_words, poisson_of_bits
 from hsnoise._types import (
     Counts,
     FrameRows,
@@ -44,7 +43,7 @@ from hsnoise._types import (
 LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
 
 
-POISSON_TABLE, POISSON_TABLE_UP_TO = 192, 80.0  # the table ends 12 standard deviations above the largest mean
+PIXELS = "pixels"  # the random key of electrons and read noise, which share the words of a pixel
 
 
 class Stage(enum.IntEnum):
@@ -121,6 +120,7 @@ class Capture(eqx.Module):
         shutter: "rolling" or "global".
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
+        differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
     """
 
     exposure_s: Scalar
@@ -129,6 +129,12 @@ class Capture(eqx.Module):
     shutter: str = eqx.field(static=True)
     sensor_key: RandomKey
     read_noise_scale: Frames | PixelMap | None = None
+    differentiable: bool = eqx.field(static=True, default=False)
+
+    def rounded(self, signal: Frames) -> Frames:
+        """The nearest whole numbers; their derivative is that of the signal if it is wanted."""
+        whole = jnp.round(signal)
+        return signal + jax.lax.stop_gradient(whole - signal) if self.differentiable else whole
 
     def fixed_key(self, name: str) -> RandomKey:
         """The key from which the effect called `name` draws what never changes on this sensor."""
@@ -147,18 +153,15 @@ class Capture(eqx.Module):
 
     def per_pixel(self, values: PerChannel) -> PixelMap:
         """Spread values [channel] over the pixels of their colour, [1, row, column]."""
-        tile = cfa_tile(self.cfa)
-        repeats = (self.shape[0] // len(tile), self.shape[1] // len(tile))
-        return jnp.tile(values[tile], repeats)[None]
+        return self.per_row(jnp.broadcast_to(values, (1, self.shape[0], len(values))))
 
     def per_row(self, values: FrameRows) -> Frames:
         """Spread values [frame, row, channel] along the columns of their colour, [frame, row, column]."""
-        tile = cfa_tile(self.cfa)
-        period = len(tile)
-        rows, columns = self.shape
-        cells = values.reshape(len(values), rows // period, period, len(self.channels))
-        pattern = cells[:, :, np.arange(period)[:, None], tile].reshape(len(values), rows, period)
-        return jnp.tile(pattern, (1, 1, columns // period))
+        tile, row = cfa_tile(self.cfa), np.arange(self.shape[0])
+        shape = (len(values), *self.shape)
+        # One number for the even and one for the odd columns of a row: loops over columns stay simple and fast.
+        even, odd = (values[:, row, tile[row % len(tile), i % len(tile)], None] for i in range(2))
+        return jnp.where(jax.lax.broadcasted_iota(jnp.int32, shape, 2) % 2 == 0, even, odd)
 
 
 class AbstractEffect(eqx.Module):
@@ -171,11 +174,15 @@ class AbstractEffect(eqx.Module):
         name: name in tables and files, unique in a model; the effect's random key derives from it.
         stage: where in the sensor it acts.
         in_series: whether what happens in a frame depends on those before it, or on how many there were.
+        adds: whether it adds electrons that do not depend on the signal.
+        stream: name of its random key; its own name if empty.
     """
 
     name: eqx.AbstractClassVar[str]
     stage: eqx.AbstractClassVar[Stage]
     in_series: ClassVar[bool] = False
+    adds: ClassVar[bool] = False
+    stream: ClassVar[str] = ""
 
     @abc.abstractmethod
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:
@@ -234,29 +241,24 @@ def shortest(value: np.ndarray | np.floating) -> float:
     return float(str(value))
 
 
-def draw_poisson(key: RandomKey, mean: Frames) -> Frames:
-    """Poisson counts of the given means, as floats; the one place where hsnoise draws them.
+def draw_poisson(key: RandomKey, mean: jax.Array, shape: tuple[int, ...]) -> Frames:
+    """Poisson counts of `shape`, as floats, of the means of the pixels or one for all.
 
     Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
     """
-    return poisson(key, jax.lax.stop_gradient(mean)).astype(mean.dtype)
+    bits = jax.random.bits(key, shape, jnp.uint32)
+    return poisson_of_bits(bits, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
 
-def draw_poisson_of_one_mean(key: RandomKey, mean: Scalar, like: Frames) -> Frames:
-    """Poisson counts of one mean for all pixels of `like`: from a table, many times faster than `draw_poisson`."""
-    mean = jax.lax.stop_gradient(mean)
+def electrons_of_pixels(key: RandomKey, mean: Frames) -> Frames:
+    """Poisson counts of the means of all pixels, from the first word of each pixel; no derivative, as above."""
+    first, _ = pixel_words(key, mean.shape)
+    return poisson_of_bits(first, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
-    def from_table(key):
-        k = jnp.arange(POISSON_TABLE, dtype=mean.dtype)
-        uniform = jax.random.uniform(key, like.shape, mean.dtype)
-        return jnp.searchsorted(gammaincc(k + 1, mean), uniform, side="right", method="scan_unrolled").astype(
-            like.dtype
-        )
 
-    def directly(key):
-        return poisson(key, jnp.broadcast_to(mean, like.shape)).astype(like.dtype)
-
-    return jax.lax.cond(mean < POISSON_TABLE_UP_TO, from_table, directly, key)
+def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
+    """Standard normal numbers from the second word of each pixel."""
+    return normal_of_bits(pixel_words(key, like.shape)[1]).astype(like.dtype)
 
 
 def coloured_normal(

@@ -34,4 +34,5 @@ class ADC(AbstractEffect):
         white = self.white_level_dn
         high = LARGEST_UINT32 if white is None else white
         dtype = jnp.uint16 if high <= np.iinfo(np.uint16).max else jnp.uint32
-        return jnp.clip(jnp.round(signal), 0, high).astype(dtype)
+        counts = capture.rounded(jnp.clip(signal, 0, high))
+        return counts if capture.differentiable else counts.astype(dtype)

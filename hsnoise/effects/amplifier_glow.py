@@ -24,6 +24,7 @@ class AmplifierGlow(AbstractEffect):
 
     name: ClassVar[str] = "amplifier_glow"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, doc="electrons of a pixel in a second where the glow is brightest")
     scale: Scalar = param("1", low=0.01, doc="distance over which the glow falls by e, in diagonals of the frame")
     row: Scalar = param("1", low=0, high=1, default=1.0, doc="row of the brightest spot: 0 the first, 1 the last")
@@ -37,4 +38,4 @@ class AmplifierGlow(AbstractEffect):
         # The small term keeps the derivative finite in the spot itself.
         distance = jnp.sqrt(squared + 1e-12)
         mean = self.rate * capture.exposure_s * jnp.exp(-distance / self.scale)
-        return signal + draw_poisson(key, jnp.broadcast_to(mean[None], signal.shape))
+        return signal + draw_poisson(key, mean[None], signal.shape)

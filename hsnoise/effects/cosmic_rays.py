@@ -24,6 +24,7 @@ class CosmicRays(AbstractEffect):
 
     name: ClassVar[str] = "cosmic_rays"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
     rate: Scalar = param("1/(Mpixel s)", low=0, doc="hits of a million pixels in a second")
     charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
 

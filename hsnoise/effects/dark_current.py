@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson_of_one_mean, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
 
 
 class DarkCurrent(AbstractEffect):
@@ -16,7 +16,8 @@ class DarkCurrent(AbstractEffect):
 
     name: ClassVar[str] = "dark_current"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, doc="dark electrons of a pixel in a second")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return signal + draw_poisson_of_one_mean(key, self.rate * capture.exposure_s, signal)
+        return signal + draw_poisson(key, self.rate * capture.exposure_s, signal.shape)

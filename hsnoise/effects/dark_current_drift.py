@@ -25,10 +25,11 @@ class DarkCurrentDrift(AbstractEffect):
 
     name: ClassVar[str] = "dark_current_drift"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
     in_series: ClassVar[bool] = True
     slope: Scalar = param("e-/s/frame", low=0, doc="growth of the dark current from one frame to the next")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frame = jnp.arange(len(signal), dtype=signal.dtype)[:, None, None]
         mean = self.slope * capture.exposure_s * frame
-        return signal + draw_poisson(key, jnp.broadcast_to(mean, signal.shape))
+        return signal + draw_poisson(key, mean, signal.shape)

@@ -24,6 +24,7 @@ class HotPixels(AbstractEffect):
 
     name: ClassVar[str] = "hot_pixels"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that are hot")
     rate: Scalar = param("e-/s", low=0, doc="mean extra dark current of a hot pixel")
 
@@ -33,4 +34,4 @@ class HotPixels(AbstractEffect):
         hot = jax.random.uniform(where, shape, signal.dtype) < self.fraction
         rates = self.rate * jax.random.exponential(how_much, shape, signal.dtype)
         mean = jnp.where(hot, rates * capture.exposure_s, 0)
-        return signal + draw_poisson(key, jnp.broadcast_to(mean, signal.shape))
+        return signal + draw_poisson(key, mean, signal.shape)

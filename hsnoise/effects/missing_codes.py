@@ -33,7 +33,8 @@ class MissingCodes(AbstractEffect):
     white_level_dn: float | None = eqx.field(static=True, default=None)
 
     def sample(self, signal: Frames | Counts, capture: Capture, *, key: RandomKey) -> Frames | Counts:
-        stretched = jnp.round(jnp.round(signal.astype(self.gain.dtype) / self.gain) * self.gain)
+        steps = capture.rounded(signal.astype(self.gain.dtype) / self.gain)
+        stretched = capture.rounded(steps * self.gain)
         limit = np.iinfo(np.uint16).max if signal.dtype == jnp.uint16 else LARGEST_UINT32
         white = limit if self.white_level_dn is None else min(self.white_level_dn, limit)
         return jnp.minimum(stretched, white).astype(signal.dtype)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax
-
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, normal_of_pixels, param
 
 
 class ReadNoise(AbstractEffect):
@@ -21,8 +19,9 @@ class ReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.READ
+    stream: ClassVar[str] = PIXELS
     sigma: Scalar = param("e-", low=0, doc="standard deviation of the read noise")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        noise = self.sigma * jax.random.normal(key, signal.shape, signal.dtype)
+        noise = self.sigma * normal_of_pixels(key, signal)
         return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._types import Frames, RandomKey
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
+from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, electrons_of_pixels
 
 
 class ShotNoise(AbstractEffect):
@@ -16,6 +16,7 @@ class ShotNoise(AbstractEffect):
 
     name: ClassVar[str] = "shot_noise"
     stage: ClassVar[Stage] = Stage.PHOTONS
+    stream: ClassVar[str] = PIXELS
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return draw_poisson(key, signal)
+        return electrons_of_pixels(key, signal)
