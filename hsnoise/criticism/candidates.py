@@ -55,15 +55,15 @@ def built_in(model: NoiseModel, darks: FrameStack) -> dict[str, Maker]:
 
 
 def given(effect: AbstractEffect) -> Maker:
-    """A user's effect: amplitude scales the parameters that may be zero, the others stay."""
+    """An effect that is ready: amplitude scales the parameters that may be 0 and have no upper bound, or may be 0."""
+    may_be_zero = {name: spec for name, spec in effect.specs().items() if spec.low == 0}
+    scaled = {name for name, spec in may_be_zero.items() if spec.high is None} or set(may_be_zero)
 
     def make(amplitude: float, rng: np.random.Generator) -> AbstractEffect:
-        changes = {
-            name: np.minimum(np.asarray(getattr(effect, name)) * amplitude, np.inf if spec.high is None else spec.high)
-            for name, spec in effect.specs().items()
-            if spec.low == 0
-        }
-        values = {name: getattr(effect, name) for name in effect.specs()} | changes
+        values = {name: np.asarray(getattr(effect, name)) for name in effect.specs()}
+        for name in scaled:
+            high = may_be_zero[name].high
+            values[name] = np.minimum(values[name] * amplitude, np.inf if high is None else high)
         return type(effect)(**values, **effect.settings())
 
     return make
@@ -106,7 +106,7 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
     def spot(f: float, rng: np.random.Generator) -> AbstractEffect:
         row, column = rng.choice([0.0, 0.5, 1.0]), rng.choice([0.0, 1.0])
         peak = 0.8 * f * max(s.read_noise, np.sqrt(s.rate * s.longest_s))
-        return fx.AmplifierGlow(peak / s.longest_s, rng.uniform(0.15, 0.5), row, column)
+        return fx.AmplifierGlow(peak / s.longest_s, rng.uniform(0.15, 0.5), row, column, rng.choice([0.7, 1.0, 1.5]))
 
     def hot(f: float, rng: np.random.Generator) -> AbstractEffect:
         return fx.HotPixels(

@@ -23,6 +23,7 @@ from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
 from hsnoise.criticism.reference import measure, reference
+from hsnoise.criticism.refine import refined
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -32,11 +33,13 @@ from hsnoise.stack import as_stack
 DRAWS = 64
 GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
 AMPLITUDES, DETAILS, MOST_LIKELY = (0.35, 1.0, 2.5), 4, 10  # and those that are most likely
-CLOSE_DETAILS = 6
+NEAR = 0.8  # share of the best score that makes a candidate a leader
+MANY_DETAILS = 16  # of which the leaders' best are taken
+AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 6  # amplitudes, relative, at which the leaders are drawn again
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
-MISFIT_LEFT, SHARE_LEFT = 3.5, 0.08
+MISFIT_LEFT, SHARE_LEFT = 3.5, 0.05
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
@@ -176,12 +179,15 @@ def _looked_at(judged: list[Judged], at_least: int, bench: Bench, evidence: Evid
 
 
 def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
-    """The leading candidates drawn again close to their amplitudes: fingerprints bend, and strong effects show it."""
-    leaders = judged[:LEADERS]
-    around = {one.of.name: (one.of.maker, tuple(CLOSE[[0, 3, -1]] * one.amplitude)) for one in leaders}
-    prints = bench.fingerprints(around, CLOSE_DETAILS)
-    drawn = [judge(of, evidence, CLOSE * one.amplitude) for of, one in zip(prints, leaders, strict=True)]
-    return _best_first([*drawn, *judged[LEADERS:]])
+    """The leading candidates with parameters closer to the capture: fingerprints bend, and strong effects show it."""
+    leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
+    wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
+    varied = [judge(of, evidence, np.array(of.amplitudes)) for of in bench.fingerprints(wanted, MANY_DETAILS)]
+    makers = {one.of.name: given(refined(one.candidate(evidence).effect, bench, evidence)) for one in varied}
+    prints = bench.fingerprints({name: (maker, AROUND) for name, maker in makers.items()}, CLOSE_DETAILS)
+    again = [judge(of, evidence, CLOSE) for of in prints]
+    better = [max(pair, key=lambda one: one.score) for pair in zip(leaders, again, strict=True)]
+    return _best_first([*better, *judged[len(leaders) :]])
 
 
 def _own(candidates: Any, model) -> dict[str, Maker]:

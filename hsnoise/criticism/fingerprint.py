@@ -11,6 +11,7 @@ from hsnoise.criticism.candidates import Maker, made
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.reference import Reference, measure
 from hsnoise.draws import draw_capture, in_threads
+from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
@@ -19,7 +20,7 @@ SLOPE_DRAWS = 3
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off
 BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
 
-Task = tuple[str, float, int]  # candidate, amplitude, detail
+Task = tuple[Maker, float, int]  # candidate, amplitude, detail
 
 
 @dataclass(frozen=True)
@@ -69,21 +70,20 @@ class Bench:
         compiled while another is drawn, and none a second time.
         """
         tasks = [
-            (name, amplitude, detail)
+            (maker, amplitude, detail)
             for detail in range(details)
-            for name, (_, amplitudes) in wanted.items()
+            for maker, amplitudes in wanted.values()
             for amplitude in amplitudes
         ]
         new = [task for task in tasks if task not in self.drawn]
 
         def draw(task: Task) -> np.ndarray:
-            name, amplitude, detail = task
-            return self._shift(self.model.add(made(wanted[name][0], amplitude, detail)), detail)
+            return self.shift_with(made(*task), task[2])
 
         self.drawn.update(zip(new, in_threads(draw, new, self.tick), strict=True))
         prints = []
         for name, (maker, amplitudes) in wanted.items():
-            shifts = [[self.drawn[name, amplitude, detail] for detail in range(details)] for amplitude in amplitudes]
+            shifts = [[self.drawn[maker, amplitude, detail] for detail in range(details)] for amplitude in amplitudes]
             prints.append(Fingerprint(name, maker, amplitudes, np.array(shifts)))
         return prints
 
@@ -93,6 +93,10 @@ class Bench:
         tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
         shifts = in_threads(lambda task: self._shift(*task), tasks, self.tick)
         return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
+
+    def shift_with(self, effect: AbstractEffect, number: int) -> np.ndarray:
+        """Shift of the statistics [statistic] that the effect makes in draw `number`."""
+        return self._shift(self.model.add(effect), number)
 
     def _shift(self, changed: NoiseModel, number: int) -> np.ndarray:
         """Statistics of draw `number` of a changed model less those of the model, of the same random numbers."""

@@ -14,7 +14,8 @@ class AmplifierGlow(AbstractEffect):
     """Extra electrons, Poisson(rate * exposure * exp(-d / scale)), at distance d from the glowing spot.
 
     Transistors in saturation emit infrared light that the neighbouring pixels see. Distances are in units of the
-    frame's diagonal; the spot lies anywhere in the frame, by default in the corner of the last row and column.
+    frame's diagonal, those along the rows divided by `aspect`; the spot lies anywhere in the frame, by default in the
+    corner of the last row and column.
 
     In dark frames: a smooth brightening toward a corner or edge that grows in proportion to exposure, with its shot
     noise.
@@ -30,10 +31,12 @@ class AmplifierGlow(AbstractEffect):
     row: Scalar = param("1", low=0, high=1, default=1.0, doc="row of the brightest spot: 0 the first, 1 the last")
     column: Scalar = param("1", low=0, high=1, default=1.0, doc="column of the brightest spot: 0 the first, 1 the last")
 
+    aspect: Scalar = param("1", low=0.1, high=10, default=1.0, doc="width of the glow over its height")
+
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         last_row, last_column = capture.shape[0] - 1, capture.shape[1] - 1
         down = jnp.arange(last_row + 1, dtype=signal.dtype) - self.row * last_row
-        right = jnp.arange(last_column + 1, dtype=signal.dtype) - self.column * last_column
+        right = (jnp.arange(last_column + 1, dtype=signal.dtype) - self.column * last_column) / self.aspect
         squared = (down[:, None] ** 2 + right[None] ** 2) / max(last_row**2 + last_column**2, 1)
         # The small term keeps the derivative finite in the spot itself.
         distance = jnp.sqrt(squared + 1e-12)
