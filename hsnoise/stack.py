@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -23,6 +23,8 @@ from hsnoise._arguments import (
 )
 from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
 from hsnoise._types import BAYER_CFAS, SHUTTERS, channels_of
+
+BATCH = 64  # frames of a Dask array that are handed to its scheduler at a time
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -144,12 +146,38 @@ class FrameStack:
         frame = read_mapped(counts, number) if isinstance(counts, np.memmap) else np.asarray(counts[number])
         if self.is_lazy(exposure):
             check_frame(frame, self, exposure=exposure, frame_number=number)
-        dtype = np.uint16 if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2 else np.int32
-        return np.ascontiguousarray(frame.T if self.row_axis == 1 else frame, dtype)
+        return in_sensor_orientation(frame, self.row_axis)
 
     def frames(self, exposure: int) -> Iterator[np.ndarray]:
         """The frames of one exposure group in order, one in memory at a time; see `frame`."""
         return (self.frame(exposure, number) for number in range(self.n_frames[exposure]))
+
+    def map_frames(
+        self, exposure: int, function: Callable[[np.ndarray], Any], combine: Callable[[Any, Any], Any] | None = None
+    ) -> Iterator[Any]:
+        """`function` of each frame of one exposure group, in order.
+
+        Frames of a Dask array are read, checked and given to `function` where its scheduler runs tasks, such as the
+        workers of a cluster, and only the results come back, those of some frames as one if `combine` adds them up. A
+        task whose worker is lost runs again elsewhere.
+        """
+        counts = self.counts[exposure]
+        if not is_dask(counts):
+            yield from map(function, self.frames(exposure))
+            return
+        import dask  # only for those who hand over a Dask array
+
+        for start in range(0, len(counts), BATCH):
+            numbers = range(start, min(start + BATCH, len(counts)))
+            names = [frame_name(self, exposure, number) for number in numbers]
+            tasks = [
+                dask.delayed(_checked)(counts[number], name, self.white_level, self.row_axis, function)
+                for number, name in zip(numbers, names, strict=True)
+            ]
+            while combine is not None and len(tasks) > 1:
+                pairs = zip(tasks[::2], tasks[1::2], strict=False)
+                tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
+            yield from dask.compute(*tasks)
 
     def check(self) -> None:
         """Read the first frame of each exposure, check its values and the black level; call before long work.
@@ -256,13 +284,30 @@ def check_frame(frame: np.ndarray, stack: FrameStack, *, exposure: int, frame_nu
         ValueError: values that are not finite, not integers, negative, all the same, or mostly at the white
             level; the message names the file (or the exposure) and the frame.
     """
+    check_values(frame, white_level=stack.white_level, name=frame_name(stack, exposure, frame_number))
+
+
+def frame_name(stack: FrameStack, exposure: int, number: int) -> str:
+    """A frame as error messages call it: its file, or its place in the stack."""
     counts = stack.counts[exposure]
     if isinstance(counts, LazyFrames):
-        name = counts.names[frame_number]
-    else:
-        group = f"{stack.kind[exposure]} exposure {exposure} ({stack.exposure_s[exposure]:g} s)"
-        name = f"counts: frame {frame_number} of {group}"
-    check_values(frame, white_level=stack.white_level, name=name)
+        return counts.names[number]
+    return f"counts: frame {number} of {stack.kind[exposure]} exposure {exposure} ({stack.exposure_s[exposure]:g} s)"
+
+
+def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
+    """Contiguous uint16, or int32 where the stored type is signed, floating or wider than 16 bits."""
+    dtype = np.uint16 if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2 else np.int32
+    return np.ascontiguousarray(frame.T if row_axis == 1 else frame, dtype)
+
+
+def is_dask(counts: Any) -> bool:
+    return hasattr(counts, "__dask_graph__")
+
+
+def _checked(frame: np.ndarray, name: str, white_level: float | None, row_axis: int, function: Callable) -> Any:
+    check_values(frame, white_level=white_level, name=name)
+    return function(in_sensor_orientation(frame, row_axis))
 
 
 def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:

@@ -8,6 +8,7 @@ pattern of light: their frame-to-frame differences are used (Janesick, *Photon T
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial, reduce
 
 import equinox as eqx
 import numpy as np
@@ -183,12 +184,10 @@ def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) 
     counts = {c: np.zeros((len(groups), frames, rows[c], bins), dtype) for c in channels}
     moments = {c: np.zeros((2, len(groups), frames, rows[c])) for c in channels}
     for e, i in enumerate(groups):
-        for f, frame in enumerate(stack.frames(i)):
+        reduced = partial(_reduced, cfa=stack.cfa, coding=coding[e], bins=bins, white_level=stack.white_level)
+        for f, frame in enumerate(stack.map_frames(i, reduced)):
             for c in channels:
-                y = channel_rows(frame, stack.cfa, c)
-                low, width, _ = coding[e][c]
-                counts[c][e, f] = _count_rows(y, low, width, bins, stack.white_level)
-                moments[c][:, e, f] = y.sum(1, dtype=np.float64), np.einsum("rp,rp->r", y, y, dtype=np.float64)
+                counts[c][e, f], moments[c][:, e, f] = frame[c]
             tick()
     edges = {c: np.stack([_edges(*of[c][:2], bins, stack.white_level) for of in coding]) for c in channels}
     return tuple(
@@ -203,6 +202,18 @@ def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) 
         )
         for c in channels
     )
+
+
+def _reduced(
+    frame: np.ndarray, cfa: str, coding: dict[str, tuple[int, int, int]], bins: int, white_level: float | None
+):
+    """Of each channel of a frame: histograms [row, bin], and sums of counts and of their squares [2, row]."""
+    out = {}
+    for c, (low, width, _) in coding.items():
+        y = channel_rows(frame, cfa, c)
+        sums = np.stack([y.sum(1, dtype=np.float64), np.einsum("rp,rp->r", y, y, dtype=np.float64)])
+        out[c] = _count_rows(y, low, width, bins, white_level).astype(np.uint32), sums
+    return out
 
 
 def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
@@ -288,6 +299,25 @@ def _check_same_light(levels: list[float], stack: FrameStack, group: int) -> Non
         )
 
 
+Moments = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def _within_rows(frame: np.ndarray, cfa: str, channels: tuple[str, ...]) -> Moments:
+    """Of each channel: counts less their row's mean, float32, their squares, the means of the rows [1, row]."""
+    out = {}
+    for c in channels:
+        y = channel_rows(frame, cfa, c).astype(np.float32)
+        row_mean = y.mean(1, dtype=np.float64)
+        y -= row_mean[:, None].astype(np.float32)
+        out[c] = y, y * y, row_mean[None]
+    return out
+
+
+def _added(a: Moments, b: Moments) -> Moments:
+    """Of all frames of both: sums of counts and squares, and the means of the rows [frame, row]."""
+    return {c: (a[c][0] + b[c][0], a[c][1] + b[c][1], np.concatenate([a[c][2], b[c][2]])) for c in a}
+
+
 def _flat_level(stack: FrameStack, group: int, tick):
     """Mean, temporal variance and row power of one flat level, each [channel]."""
     if stack.n_frames[group] < 2:
@@ -296,24 +326,16 @@ def _flat_level(stack: FrameStack, group: int, tick):
             " least two frames of the same light, because only differences are free of the fixed pattern"
         )
     channels, n = stack.channels, stack.n_frames[group]
-    totals: dict[str, list] = {c: [0.0, 0.0, []] for c in channels}
-    for frame in stack.frames(group):
-        for c in channels:
-            y = channel_rows(frame, stack.cfa, c).astype(np.float32)
-            row_mean = y.mean(1, dtype=np.float64)
-            y -= row_mean[:, None].astype(np.float32)
-            totals[c][0] = totals[c][0] + y
-            totals[c][1] = totals[c][1] + y * y
-            totals[c][2].append(row_mean)
+    totals = reduce(_added, stack.map_frames(group, partial(_within_rows, cfa=stack.cfa, channels=channels), _added))
+    for _ in range(n):
         tick()
     out = []
     for c in channels:
-        first, second, means = totals[c]
-        _check_same_light([m.mean() for m in means], stack, group)
+        first, second, series = totals[c]
+        _check_same_light(list(series.mean(1)), stack, group)
         rows, pixels = first.shape
         dof = rows * (pixels - 1) * (n - 1)
         variance = float((second.astype(np.float64) - first.astype(np.float64) ** 2 / n).sum() / dof)
-        series = np.stack(means)
         moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
         moving -= moving.mean(0, keepdims=True)
         row_dof = (rows - 1) * (n - 1)

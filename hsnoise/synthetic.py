@@ -30,9 +30,11 @@ COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
 ITERATIONS = 3
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
+MOST_SPREAD = 0.25  # variance of a base coordinate, mostly a logarithm, from which it is unknown
 LONGEST_STEP = 1.5
 SHRINKAGE = 0.1
 MARGIN = 1.15
+MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
 @dataclass(frozen=True)
@@ -93,12 +95,22 @@ class Problem:
             return np.asarray(self.coordinates.vector(self.coordinates.base))
 
     @cached_property
-    def whiten(self) -> np.ndarray:
-        """Square root of the covariance of the base coordinates, directions without information cut to 1."""
+    def spread(self) -> tuple[np.ndarray, np.ndarray]:
+        """Variances and directions of the covariance of the base coordinates."""
         slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12)
-        covariance = self.base.covariance / slope[:, None] / slope[None, :]
-        values, vectors = np.linalg.eigh(covariance)
-        return vectors * np.sqrt(np.clip(values, 1e-16, 1.0))
+        return np.linalg.eigh(self.base.covariance / slope[:, None] / slope[None, :])
+
+    @cached_property
+    def whiten(self) -> np.ndarray:
+        """Square root of the covariance of the base coordinates, directions without information cut to MOST_SPREAD."""
+        values, vectors = self.spread
+        return vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
+
+    @property
+    def prior(self) -> np.ndarray:
+        """Inverse variances that keep numbers near the start: of effects, and where the base fit knew nothing."""
+        base = np.where(self.spread[0] < MOST_SPREAD, 1e-6, 1.0)
+        return np.concatenate([base, np.full(len(self.knobs), PRIOR_SIGMA**-2)])
 
     def slope(self, vector: np.ndarray) -> np.ndarray:
         """d parameter / d coordinate of the base."""
@@ -186,7 +198,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     measured, _ = problem.statistics(darks)
     y, n = problem.start, len(problem.centre)
     scale, weight = _weights(problem, y, tick)
-    prior = np.concatenate([np.full(n, 1e-6), np.full(len(problem.knobs), PRIOR_SIGMA**-2)])
+    prior = problem.prior
     for _ in range(ITERATIONS):
         drawn, slopes = _draws_and_slopes(problem, y, tick)
         mean, slopes = drawn.mean(0), slopes / scale[:, None]
@@ -238,8 +250,9 @@ def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     The effects' own errors are widened by as much.
     """
     n = len(base)
-    growth = np.sqrt(np.maximum(np.diagonal(base) / np.diagonal(covariance)[:n], 1.0))
-    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(growth))])
+    growth = np.sqrt(np.maximum(np.diagonal(base) / np.maximum(np.diagonal(covariance)[:n], 1e-300), 1.0))
+    known = growth[growth < MOST_GROWTH]
+    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(known) if known.size else 1.0)])
     return covariance * factor[:, None] * factor[None, :]
 
 

@@ -39,7 +39,7 @@ AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 6  # amplitudes, relative, at which the
 EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
-MISFIT_LEFT, SHARE_LEFT = 3.5, 0.05
+MISFIT_LEFT, SHARE_LEFT, MOST_LEFT = 3.5, 0.05, 10.0
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
@@ -204,7 +204,7 @@ def _own(candidates: Any, model) -> dict[str, Maker]:
 def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) -> Diagnosis:
     scores = evidence.null.normal_scores(evidence.z, evidence.groups)
     worst = max(scores.values())
-    allowed = max(MISFIT_LEFT, SHARE_LEFT * worst)
+    allowed = min(max(MISFIT_LEFT, SHARE_LEFT * worst), MOST_LEFT)
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
     names: tuple[str, ...] = (first.name,)
     left = first.misfit

@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise.criticism.compare import Comparison, compare
-from hsnoise.criticism.diagnose import Diagnosis, diagnose
+from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, diagnose
 from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import darks_of
 from hsnoise.effects import AbstractEffect
@@ -22,7 +23,7 @@ from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
-MOST_STEPS = 4
+MOST_STEPS = 6
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 HELD_OUT_DRAWS = 40
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
@@ -109,6 +110,9 @@ def improve(
 ) -> Story:
     """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
 
+    Where no effect explains all that is missing, as in most real sensors, the one that comes nearest is added and the
+    story goes on; it is told as finished only if nothing significant is left.
+
     Args:
         stack: FrameStack, or a bare array with FrameStack's keywords.
         model: where to start; default: all effects of the paper.
@@ -132,17 +136,24 @@ def improve(
         own = [c for c in candidates if c.name not in last.fit.params]
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)
         steps[-1] = last = replace(last, diagnosis=found)
-        if found.best is None:
+        nearest = _nearest(found)
+        if nearest is None:
             return Story(tuple(steps), _end(found, last.comparison))
-        say(f"Adding {found.best.name}")
-        result = _with_one_more(steps, found.best.effect, fitted)
-        step = _step(result, fitted, held_out, found.best.name, last, seed, say)
+        say(f"Adding {nearest.name}")
+        result = _with_one_more(steps, nearest.effect, fitted)
+        step = _step(result, fitted, held_out, nearest.name, last, seed, say)
         if step.held_out - last.held_out < WORSE or step.comparison.error > last.comparison.error:
-            reason = (
-                f"{found.best.name} was tried, but held-out frames or statistics fit worse with it: it was left out"
-            )
+            reason = f"{nearest.name} was tried, but held-out frames or statistics fit worse with it: it was left out"
             return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
         steps.append(step)
+
+
+def _nearest(found: Diagnosis) -> Candidate | None:
+    """What to add: the effect that is named, or else the one that explains most of what no effect explains alone."""
+    if found.best is not None or found.verdict == "nothing missing":
+        return found.best
+    first = found.ranking[0]
+    return first if first.score > EVIDENCE else None
 
 
 def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack) -> FitResult:
@@ -189,11 +200,16 @@ def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
 def _end(found: Diagnosis, comparison: Comparison) -> str:
     if found.verdict == "nothing missing":
         return f"Nothing significant is left (error {comparison.error:.2f})."
-    return f"Something is left that no effect of the library explains (error {comparison.error:.2f}): {found.advice}."
+    advice = f": {found.advice}" if found.advice else ""
+    return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
 
 
 def _because(step: Step) -> str:
-    if step.comparison.worst:
-        return step.comparison.worst[0]
     found = step.diagnosis
-    return f"its fingerprint is in the statistics (score {found.ranking[0].score:.0f} nats)" if found else ""
+    if step.comparison.worst:
+        reason = step.comparison.worst[0]
+    else:
+        reason = f"its fingerprint is in the statistics (score {found.ranking[0].score:.0f} nats)" if found else ""
+    if found is not None and found.verdict == "unexplained":
+        return f"{reason} (no effect explains all of it; this one comes nearest)"
+    return reason
