@@ -1,0 +1,261 @@
+"""How fast: sampling, its gradient, histograms, fits and diagnosis, side by side with what users would take instead.
+
+    python -m benchmarks.speed
+    python -m benchmarks.speed --only sampling,passes --rounds 3
+
+Contestants take turns, so that a busy machine slows all alike; the table gives medians. PyTorch takes part if it is
+installed. Growth is the slope of log time against log size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import hsnoise
+from hsnoise.effects import ADC
+from hsnoise.statistics import summarise
+
+FRAMES, ROWS, COLUMNS = 8, 1024, 1024
+READ_E, GAIN, ROW_SIGMA, DARK_E, WHITE = 3.5, 1.3, 0.2, 2.6, 16383
+
+
+@dataclass(frozen=True)
+class Line:
+    """A row of the report: what was measured, for whom, and the median of its rate or time."""
+
+    part: str
+    what: str
+    who: str
+    value: float
+    unit: str
+
+
+def model() -> hsnoise.NoiseModel:
+    """The paper's model whole, 14 bit."""
+    return hsnoise.cameras.canon_5d3().remove("adc").add(ADC(WHITE))
+
+
+def medians(contestants: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median seconds of each, in turns, after one call that may compile."""
+    for run in contestants.values():
+        jax.block_until_ready(run())
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for _ in range(rounds):
+        for name, run in contestants.items():
+            start = time.perf_counter()
+            jax.block_until_ready(run())
+            seconds[name].append(time.perf_counter() - start)
+    return {name: float(np.median(values)) for name, values in seconds.items()}
+
+
+def threaded_numpy(mean_e, threads: int) -> Callable[[], np.ndarray]:
+    """The same model by NumPy's fastest generator, a share of the frames in each thread."""
+    out = np.empty((FRAMES, ROWS, COLUMNS), np.uint16)
+
+    def share(i: int) -> None:
+        generator = np.random.Generator(np.random.SFC64(i))
+        part = slice(i * FRAMES // threads, (i + 1) * FRAMES // threads)
+        shape = out[part].shape
+        electrons = generator.poisson(mean_e if np.isscalar(mean_e) else mean_e[part], shape).astype(np.float32)
+        electrons += np.float32(READ_E) * generator.standard_normal(shape, np.float32)
+        beta = np.maximum(1 + np.float32(ROW_SIGMA) * generator.standard_normal((*shape[:2], 1), np.float32), 0)
+        out[part] = np.clip(np.rint(np.float32(GAIN) * beta * electrons), 0, WHITE)
+
+    def run() -> np.ndarray:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(share, range(threads)))
+        return out
+
+    return run
+
+
+def by_jax_random(mean_e) -> Callable[[], jax.Array]:
+    @jax.jit
+    def run(key, mean):
+        shot, read, row = jax.random.split(key, 3)
+        shape = (FRAMES, ROWS, COLUMNS)
+        electrons = jax.random.poisson(shot, mean, shape) + READ_E * jax.random.normal(read, shape)
+        beta = jnp.maximum(1 + ROW_SIGMA * jax.random.normal(row, (FRAMES, ROWS, 1)), 0)
+        return jnp.clip(jnp.round(GAIN * beta * electrons), 0, WHITE).astype(jnp.uint16)
+
+    mean = jnp.asarray(mean_e, jnp.float32)
+    return lambda: run(jax.random.key(0), mean)
+
+
+def by_torch(mean_e) -> Callable[[], object] | None:
+    try:
+        import torch
+    except ImportError:
+        return None
+    shape = (FRAMES, ROWS, COLUMNS)
+    mean = torch.full(shape, mean_e) if np.isscalar(mean_e) else torch.from_numpy(mean_e)
+
+    def run():
+        beta = torch.clamp(1 + ROW_SIGMA * torch.randn(FRAMES, ROWS, 1), min=0)
+        y = GAIN * beta * (torch.poisson(mean) + READ_E * torch.randn(shape))
+        return torch.clamp(torch.round(y), 0, WHITE).to(torch.int32)
+
+    return run
+
+
+def sampling(rounds: int) -> list[Line]:
+    clean = np.random.default_rng(0).uniform(0.5, 50, (FRAMES, ROWS, COLUMNS)).astype(np.float32)
+    on_device, camera, key, threads = jnp.asarray(clean), model(), jax.random.key(0), os.cpu_count() or 1
+    lines = []
+    for what, mean_e, own in (
+        ("mean of 0.5 to 50 e- by pixel", clean, lambda: hsnoise.sample(key, on_device, camera)),
+        ("one mean, 2.6 e-", DARK_E, lambda: hsnoise.sample_dark(key, FRAMES, (ROWS, COLUMNS), camera)),
+    ):
+        contestants = {
+            "hsnoise.sample": own,
+            f"NumPy, {threads} threads": threaded_numpy(mean_e, threads),
+            "jax.random": by_jax_random(mean_e),
+        }
+        torch = by_torch(mean_e)
+        if torch is not None:
+            contestants["PyTorch"] = torch
+        lines += [Line("sampling", what, who, rate(t), "Mpixel/s") for who, t in medians(contestants, rounds).items()]
+    bits = jax.jit(lambda key: jax.random.bits(key, (FRAMES, ROWS, COLUMNS), jnp.uint32))
+    copy = jax.jit(lambda x: x + 1)
+    floors = {"jax.random.bits, 32 a pixel": lambda: bits(key), "copy of float32": lambda: copy(on_device)}
+    return lines + [Line("sampling", "floor", who, rate(t), "Mpixel/s") for who, t in medians(floors, rounds).items()]
+
+
+def gradient(rounds: int) -> list[Line]:
+    """Of the mean square of 1 Mpixel of samples by all parameters."""
+    camera, key = model(), jax.random.key(0)
+    light = jnp.full((1, ROWS, COLUMNS), 10.0)
+
+    @jax.jit
+    def slope(camera, light):
+        return jax.grad(lambda c: jnp.mean(hsnoise.sample(key, light, c, differentiable=True) ** 2))(camera)
+
+    times = medians({"hsnoise.sample": lambda: jax.tree.leaves(slope(camera, light))}, rounds)
+    return [Line("gradient", "by all parameters", w, rate(t, 1), "Mpixel/s") for w, t in times.items()]
+
+
+def dark_stack(frames: int, shape: tuple[int, int], exposures: int = 4, cfa: str = "RGGB") -> hsnoise.FrameStack:
+    camera, exposure_s = model(), np.geomspace(0.02, 0.2, exposures)
+    counts = [
+        np.asarray(hsnoise.sample_dark(jax.random.key(i), frames, shape, camera, exposure_s=float(t)))
+        for i, t in enumerate(exposure_s)
+    ]
+    return hsnoise.FrameStack(counts, exposure_s, black_level=0, white_level=WHITE, cfa=cfa, shutter="rolling")
+
+
+def passes(rounds: int) -> list[Line]:
+    stack = dark_stack(2, (ROWS, COLUMNS))
+    pixels = 8 * ROWS * COLUMNS / 1e6
+    times = medians({"hsnoise.summarise": lambda: summarise(stack).histograms[0].counts}, rounds)
+    return [Line("passes", "row histograms from memory", w, pixels / t, "Mpixel/s") for w, t in times.items()]
+
+
+def fit(rounds: int) -> list[Line]:
+    summary = summarise(dark_stack(8, (160, 240)))
+    start = time.perf_counter()
+    hsnoise.fit(summary)
+    first = time.perf_counter() - start
+    again = medians({"hsnoise.fit": lambda: hsnoise.fit(summary).covariance}, rounds)["hsnoise.fit"]
+    what = "4 x 8 x 160 x 240, after the histograms"
+    return [
+        Line("fit", f"{what}, first", "hsnoise.fit", first, "s"),
+        Line("fit", f"{what}, compiled", "hsnoise.fit", again, "s"),
+    ]
+
+
+def growth(rounds: int) -> list[Line]:
+    """Slopes of log time against log size."""
+    camera, key = model(), jax.random.key(0)
+    sides, seconds = (256, 512, 1024, 2048), []
+    for side in sides:
+        times = medians({"": lambda side=side: hsnoise.sample_dark(key, 4, (side, side), camera)}, rounds)
+        seconds.append(times[""])
+    lines = [Line("growth", "sampling against pixels", "hsnoise.sample", slope_of(np.square(sides), seconds), "slope")]
+    seconds = []
+    for side in sides[:3]:
+        stack = dark_stack(2, (side, side))
+        seconds.append(medians({"": lambda stack=stack: summarise(stack).exposure_s}, rounds)[""])
+    slope = slope_of(np.square(sides[:3]), seconds)
+    return [*lines, Line("growth", "row histograms against pixels", "hsnoise.summarise", slope, "slope")]
+
+
+def diagnose(rounds: int) -> list[Line]:
+    stack = dark_stack(8, (160, 240))
+    fitted = hsnoise.fit(stack)
+    lines = []
+    for what, run in (
+        ("diagnose", lambda: hsnoise.diagnose(fitted, stack)),
+        ("compare", lambda: hsnoise.compare(fitted.params, stack)),
+    ):
+        for when in ("first", "compiled"):
+            start = time.perf_counter()
+            run()
+            lines.append(
+                Line("diagnose", f"4 x 8 x 160 x 240, {when}", f"hsnoise.{what}", time.perf_counter() - start, "s")
+            )
+    return lines
+
+
+PARTS = {
+    "sampling": sampling,
+    "gradient": gradient,
+    "passes": passes,
+    "fit": fit,
+    "growth": growth,
+    "diagnose": diagnose,
+}
+
+
+def rate(seconds: float, frames: int = FRAMES) -> float:
+    return frames * ROWS * COLUMNS / 1e6 / seconds
+
+
+def slope_of(sizes, seconds) -> float:
+    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+
+
+def machine() -> str:
+    device = jax.devices()[0]
+    return f"{platform.machine()}, {os.cpu_count()} cores, {device.device_kind}, jax {jax.__version__}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", help=f"some of {', '.join(PARTS)}, separated by commas")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each contestant")
+    parser.add_argument("--out", type=Path, default=Path("build/speed.md"), help="the table as Markdown")
+    arguments = parser.parse_args()
+    chosen = arguments.only.split(",") if arguments.only else list(PARTS)
+    unknown = sorted(set(chosen) - set(PARTS))
+    if unknown or arguments.rounds < 1:
+        parser.error(f"--only: expected some of {', '.join(PARTS)}; --rounds: expected at least 1")
+    console = Console(width=120)
+    lines = []
+    for part in chosen:
+        with console.status(part):
+            lines += PARTS[part](arguments.rounds)
+    table = Table("", "what", "who", "median", "unit", title=f"Speed ({machine()})")
+    for line in lines:
+        table.add_row(line.part, line.what, line.who, f"{line.value:.3g}", line.unit)
+    console.print(table)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    rows = [f"| {line.what} | {line.who} | {line.value:.3g} {line.unit} |" for line in lines]
+    arguments.out.write_text("\n".join([f"{machine()}\n", "| what | who | median |", "|---|---|---|", *rows, ""]))
+    print(f"Written to {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()
