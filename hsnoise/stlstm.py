@@ -1,0 +1,302 @@
+"""The video enhancer: a recurrent network of spatio-temporal LSTM layers, trained on noise that hsnoise draws.
+
+Frames go in one by one and come out enhanced; what earlier frames told is kept in a state of constant size. Arrays are
+[batch, row, column, map]; a frame may also come without its batch.
+
+Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019 (network and
+loss); Wang, Long, Wang, Gao, Yu, "PredRNN: recurrent neural networks for predictive learning using spatiotemporal
+LSTMs", NeurIPS 2017 (cell).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._types import RandomKey
+
+LAYOUT = ("NHWC", "HWIO", "NHWC")
+FORGET_BIAS = 1.0
+L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equation 10
+
+
+@jax.custom_vjp
+def convolve(x: jax.Array, weight: jax.Array) -> jax.Array:
+    """Convolution of x [batch, row, column, in] with weight [row, column, in, out], same size, zeros outside.
+
+    Its derivative by the weight is a sum of matrix products, one for each place in the kernel: XLA's own, a
+    convolution with a kernel as large as the image, is ten times slower inside loops on a CPU.
+    """
+    return jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=LAYOUT)
+
+
+def _forward(x, weight):
+    return convolve(x, weight), (x, weight)
+
+
+def _backward(residuals, slope):
+    x, weight = residuals
+    turned = jnp.flip(weight, (0, 1)).swapaxes(2, 3)
+    by_x = jax.lax.conv_general_dilated(slope, turned, (1, 1), "SAME", dimension_numbers=LAYOUT)
+    height, width = weight.shape[:2]
+    rows, columns = x.shape[1:3]
+    above, left = (height - 1) // 2, (width - 1) // 2
+    padded = jnp.pad(x, ((0, 0), (above, height - 1 - above), (left, width - 1 - left), (0, 0)))
+    by_weight = [
+        [jnp.einsum("bhwi,bhwo->io", padded[:, r : r + rows, c : c + columns], slope) for c in range(width)]
+        for r in range(height)
+    ]
+    return by_x, jnp.stack([jnp.stack(row) for row in by_weight])
+
+
+convolve.defvjp(_forward, _backward)
+
+
+class Convolution(eqx.Module):
+    """A convolution of odd kernel size that keeps the size of the image."""
+
+    weight: jax.Array
+    bias: jax.Array
+
+    def __init__(self, key: RandomKey, kernel: int, inputs: int, outputs: int):
+        """Weights are normal with variance 1 / (kernel^2 inputs); biases are 0."""
+        scale = 1 / np.sqrt(kernel**2 * inputs)
+        self.weight = jnp.float32(scale) * jax.random.normal(key, (kernel, kernel, inputs, outputs), jnp.float32)
+        self.bias = jnp.zeros(outputs, jnp.float32)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return convolve(x, self.weight) + self.bias[None, None, None]
+
+
+class Cell(eqx.Module):
+    """One ST-LSTM layer: cell C stays in the layer from frame to frame, memory M comes from the layer below."""
+
+    of_input: Convolution
+    of_hidden: Convolution
+    of_memory: Convolution
+    of_both: Convolution
+    merge: Convolution
+    maps: int = eqx.field(static=True)
+
+    def __init__(self, key: RandomKey, kernel: int, maps: int):
+        keys = jax.random.split(key, 5)
+        self.of_input = Convolution(keys[0], kernel, maps, 7 * maps)
+        self.of_hidden = Convolution(keys[1], kernel, maps, 4 * maps)
+        self.of_memory = Convolution(keys[2], kernel, maps, 3 * maps)
+        self.of_both = Convolution(keys[3], kernel, 2 * maps, maps)
+        self.merge = Convolution(keys[4], 1, 2 * maps, maps)
+        self.maps = maps
+
+    def __call__(self, x: jax.Array, hidden: jax.Array, cell: jax.Array, memory: jax.Array):
+        """(hidden, cell, memory) after a frame whose features are x."""
+        x_g, x_i, x_f, x_gm, x_im, x_fm, x_o = jnp.split(self.of_input(x), 7, -1)
+        h_g, h_i, h_f, h_o = jnp.split(self.of_hidden(hidden), 4, -1)
+        m_g, m_i, m_f = jnp.split(self.of_memory(memory), 3, -1)
+        forget = jax.nn.sigmoid(x_f + h_f + FORGET_BIAS)
+        cell = forget * cell + jax.nn.sigmoid(x_i + h_i) * jnp.tanh(x_g + h_g)
+        forget = jax.nn.sigmoid(x_fm + m_f + FORGET_BIAS)
+        memory = forget * memory + jax.nn.sigmoid(x_im + m_i) * jnp.tanh(x_gm + m_g)
+        both = jnp.concatenate([cell, memory], -1)
+        hidden = jax.nn.sigmoid(x_o + h_o + self.of_both(both)) * jnp.tanh(self.merge(both))
+        return hidden, cell, memory
+
+
+class State(eqx.Module):
+    """What the network remembers: hidden and cell of each layer, and the memory that the top layer hands on.
+
+    All are [batch, row, column, map], rows and columns those of the features.
+    """
+
+    hidden: tuple[jax.Array, ...]
+    cell: tuple[jax.Array, ...]
+    memory: jax.Array
+
+
+class STLSTM(eqx.Module):
+    """The enhancer: features of blocks of stride x stride pixels, ST-LSTM layers, and a convolution back to pixels.
+
+    The features, and the frame itself, are added on the way out, so that the layers learn what to change.
+
+    Attributes:
+        stride: side of the blocks; kernels: kernel size of each layer; maps: feature maps; channels: of a frame.
+    """
+
+    features: Convolution
+    cells: tuple[Cell, ...]
+    output: Convolution
+    maps: int = eqx.field(static=True)
+    kernels: tuple[int, ...] = eqx.field(static=True)
+    stride: int = eqx.field(static=True)
+    channels: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        key: RandomKey,
+        *,
+        maps: int = 64,
+        kernels: Sequence[int] = (3, 5, 5, 3),
+        stride: int = 2,
+        channels: int = 3,
+    ):
+        """Make an untrained network; it returns frames nearly as they are.
+
+        Raises:
+            ValueError: for sizes below 1 or even kernels.
+        """
+        for name, value in {"maps": maps, "stride": stride, "channels": channels}.items():
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+        if not kernels or any(kernel < 1 or kernel % 2 == 0 for kernel in kernels):
+            raise ValueError(f"kernels: expected odd sizes, one a layer, got {tuple(kernels)}")
+        first, last, *rest = jax.random.split(key, 2 + len(kernels))
+        self.features = Convolution(first, 3, channels * stride**2, maps)
+        self.cells = tuple(Cell(key, kernel, maps) for key, kernel in zip(rest, kernels, strict=True))
+        output = Convolution(last, 3, maps, channels * stride**2)
+        self.output = eqx.tree_at(lambda c: c.weight, output, 0.1 * output.weight)
+        self.maps, self.kernels, self.stride, self.channels = maps, tuple(kernels), stride, channels
+
+    def init_state(self, shape: tuple[int, int], batch: int = 1) -> State:
+        """The state before the first frame of `shape` (rows, columns)."""
+        rows, columns = (-(-n // self.stride) for n in shape)
+        zero = jnp.zeros((batch, rows, columns, self.maps), jnp.float32)
+        return State((zero,) * len(self.cells), (zero,) * len(self.cells), zero)
+
+    def __call__(self, frame: jax.Array, state: State) -> tuple[jax.Array, State]:
+        """One frame, enhanced, and the state after it.
+
+        Args:
+            frame: linear light, [row, column, channel] or [batch, row, column, channel], of any size.
+            state: from `init_state` of this size, or after the frame before.
+
+        Raises:
+            ValueError: for a frame of other channels, or of another size or batch than the state.
+        """
+        single = frame.ndim == 3
+        frames = jnp.asarray(frame[None] if single else frame, self.features.weight.dtype)
+        self._check(frames, state)
+        rows, columns = frames.shape[1:3]
+        missing = [(-n) % self.stride for n in (rows, columns)]
+        padded = jnp.pad(frames, ((0, 0), (0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
+        features = self.features(to_blocks(padded, self.stride))
+        x, memory, hidden, cell = features, state.memory, [], []
+        for layer, h, c in zip(self.cells, state.hidden, state.cell, strict=True):
+            x, c, memory = layer(x, h, c, memory)
+            hidden.append(x)
+            cell.append(c)
+        change = from_blocks(self.output(x + features), self.stride)
+        out = frames + change[:, :rows, :columns]
+        return (out[0] if single else out), State(tuple(hidden), tuple(cell), memory)
+
+    def _check(self, frames: jax.Array, state: State) -> None:
+        if frames.ndim != 4 or frames.shape[-1] != self.channels:
+            raise ValueError(f"frame: expected [row, column, {self.channels}] or a batch of it, got {frames.shape}")
+        expected = (len(frames), *(-(-n // self.stride) for n in frames.shape[1:3]))
+        if state.memory.shape[:3] != expected:
+            raise ValueError(
+                f"state: made for a batch, rows and columns of features of {state.memory.shape[:3]}, the frame needs"
+                f" {expected}; make one with init_state"
+            )
+
+    def video(self, frames: jax.Array, *, checkpoint: bool = False) -> jax.Array:
+        """All frames [time, batch, row, column, channel], enhanced one after the other from an empty state.
+
+        checkpoint: forget what happens inside a frame and compute it again for the gradient, in a third of the memory.
+        """
+        step = jax.checkpoint(_step) if checkpoint else _step
+        state = self.init_state(frames.shape[2:4], frames.shape[1])
+        _, out = jax.lax.scan(lambda state, frame: step(self, frame, state), state, frames)
+        return out
+
+
+def _step(net: STLSTM, frame: jax.Array, state: State) -> tuple[State, jax.Array]:
+    out, state = net(frame, state)
+    return state, out
+
+
+def to_blocks(x: jax.Array, stride: int) -> jax.Array:
+    """[batch, row, column, channel] to [batch, block row, block column, pixel of the block and channel]."""
+    batch, rows, columns, channels = x.shape
+    x = x.reshape(batch, rows // stride, stride, columns // stride, stride, channels)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(batch, rows // stride, columns // stride, -1)
+
+
+def from_blocks(x: jax.Array, stride: int) -> jax.Array:
+    """The inverse of `to_blocks`."""
+    batch, rows, columns, _ = x.shape
+    x = x.reshape(batch, rows, columns, stride, stride, -1).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(batch, rows * stride, columns * stride, -1)
+
+
+def enhance(net: STLSTM, frames: Iterable[np.ndarray], *, tile: int | None = None, margin: int = 32) -> Iterator:
+    """Enhance a video of any length in constant memory.
+
+    Args:
+        net: the network; frames: [row, column, channel], linear light, one after the other.
+        tile: side of the tiles into which large frames are cut, pixels; None: whole frames. The result is that of
+            whole frames wherever the network does not look further than `margin` pixels beyond a tile.
+        margin: pixels that tiles overlap, a multiple of the stride.
+
+    Raises:
+        ValueError: for a tile or margin that the stride does not divide; frames that change size.
+    """
+    if tile is not None and (tile <= 0 or tile % net.stride or margin < 0 or margin % net.stride):
+        raise ValueError(f"tile, margin: expected multiples of the stride {net.stride}, got {tile}, {margin}")
+    step = eqx.filter_jit(lambda net, frame, state: net(frame, state))
+    states: dict[tuple[int, ...], State] = {}
+    shape = None
+    for number, frame in enumerate(frames):
+        if shape is not None and frame.shape != shape:
+            raise ValueError(f"frames: frame {number} has shape {frame.shape}, those before {shape}")
+        shape = frame.shape
+        out = np.empty(shape, np.float32)
+        for whole, inner, target in _tiles(shape[:2], tile, margin):
+            part = jnp.asarray(frame[whole], jnp.float32)
+            place = tuple(of.start for of in target)
+            state = states.get(place) or net.init_state(part.shape[:2])
+            enhanced, states[place] = step(net, part, state)
+            out[target] = np.asarray(enhanced)[inner]
+        yield out
+
+
+def _tiles(shape: tuple[int, int], tile: int | None, margin: int) -> Iterator[tuple[tuple[slice, ...], ...]]:
+    """Of each tile: what is read of the frame, what is kept of that, and where it goes."""
+    if tile is None:
+        everything = (slice(0, shape[0]), slice(0, shape[1]))
+        yield everything, everything, everything
+        return
+    for top in range(0, shape[0], tile):
+        for left in range(0, shape[1], tile):
+            target, whole, inner = [], [], []
+            for start, size in ((top, shape[0]), (left, shape[1])):
+                first, last = max(start - margin, 0), min(start + tile + margin, size)
+                stop = min(start + tile, size)
+                target.append(slice(start, stop))
+                whole.append(slice(first, last))
+                inner.append(slice(start - first, stop - first))
+            yield tuple(whole), tuple(inner), tuple(target)
+
+
+def total_variation(frames: jax.Array) -> jax.Array:
+    """Sum of absolute differences of neighbouring pixels [..., row, column, channel], mean over frames."""
+    down = jnp.abs(jnp.diff(frames, axis=-3)).sum((-3, -2, -1))
+    across = jnp.abs(jnp.diff(frames, axis=-2)).sum((-3, -2, -1))
+    return jnp.mean(down + across)
+
+
+def loss(enhanced: jax.Array, clean: jax.Array, perceptual=None) -> jax.Array:
+    """Equation 10 of the paper: 5 L2 + L1 + 0.06 perceptual + 2e-6 total variation, mean over frames.
+
+    Args:
+        enhanced, clean: [..., row, column, channel].
+        perceptual: features of frames, such as those of VGG-16; None leaves that term out.
+    """
+    difference = enhanced - clean
+    value = L2 * jnp.mean(difference**2) + L1 * jnp.mean(jnp.abs(difference))
+    value = value + TOTAL_VARIATION * total_variation(enhanced)
+    if perceptual is not None:
+        value = value + PERCEPTUAL * jnp.mean((perceptual(enhanced) - perceptual(clean)) ** 2)
+    return value

@@ -1,0 +1,137 @@
+"""The enhancer: its convolution, streaming, sizes, tiles and loss."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hsnoise.stlstm import LAYOUT, STLSTM, convolve, enhance, from_blocks, loss, to_blocks, total_variation
+
+KEY = jax.random.key(2)
+NET = STLSTM(KEY, maps=4, kernels=(3, 5), stride=2)
+
+
+def video(frames, shape, batch=1, seed=0):
+    return np.random.default_rng(seed).uniform(0, 1, (frames, batch, *shape, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+def test_convolution_has_the_derivatives_of_xlas(kernel):
+    x = jax.random.normal(KEY, (2, 7, 9, 3), jnp.float32)
+    weight = jax.random.normal(KEY, (kernel, kernel, 3, 4), jnp.float32)
+
+    def plain(x, weight):
+        return jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=LAYOUT)
+
+    np.testing.assert_allclose(convolve(x, weight), plain(x, weight), rtol=1e-5, atol=1e-5)
+    found, expected = (jax.grad(lambda *a, f=f: jnp.sum(f(*a) ** 2), (0, 1))(x, weight) for f in (convolve, plain))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_blocks_are_undone():
+    x = jax.random.normal(KEY, (2, 6, 9, 3), jnp.float32)
+    np.testing.assert_array_equal(from_blocks(to_blocks(x, 3), 3), x)
+
+
+def test_frame_by_frame_is_the_whole_video():
+    frames = video(4, (10, 12))
+    whole = NET.video(jnp.asarray(frames))
+    state = NET.init_state((10, 12))
+    for frame, expected in zip(frames, whole, strict=True):
+        out, state = NET(jnp.asarray(frame), state)
+        np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_frame_depends_on_those_before_not_after():
+    frames = video(3, (8, 8))
+    changed = frames.copy()
+    changed[1] += 0.5
+    one, other = (np.asarray(NET.video(jnp.asarray(f))) for f in (frames, changed))
+    np.testing.assert_array_equal(one[0], other[0])
+    assert np.abs(one[2] - other[2]).max() > 1e-5
+
+
+def test_checkpoint_changes_no_gradient():
+    frames = jnp.asarray(video(3, (8, 8), batch=2))
+
+    def slope(checkpoint):
+        return eqx.filter_grad(lambda net: jnp.sum(net.video(frames, checkpoint=checkpoint) ** 2))(NET)
+
+    for one, other in zip(jax.tree.leaves(slope(True)), jax.tree.leaves(slope(False)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+
+
+@settings(max_examples=4, deadline=None)
+@given(rows=st.integers(1, 13), columns=st.integers(1, 13), stride=st.sampled_from([1, 2, 3]))
+def test_any_size(rows, columns, stride):
+    net = STLSTM(KEY, maps=2, kernels=(3,), stride=stride)
+    frame = jnp.ones((rows, columns, 3))
+    out, state = net(frame, net.init_state((rows, columns)))
+    assert out.shape == frame.shape and np.isfinite(out).all()
+    assert net(out, state)[0].shape == frame.shape
+
+
+def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
+    frames = video(2, (48, 60), seed=3)[:, 0]
+    whole, tiled = (list(enhance(NET, frames, tile=tile, margin=24)) for tile in (None, 16))
+    # In two frames the network sees 2 x (3 x 3 and its output) blocks of two pixels: less than 24 pixels.
+    for one, other in zip(whole, tiled, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_a_few_steps_learn():
+    clean = jnp.full((4, 2, 16, 16, 3), 0.5)
+    noisy = clean + 0.2 * jax.random.normal(KEY, clean.shape)
+
+    optimiser = optax.adam(1e-2)
+    net, memory, values = NET, optimiser.init(eqx.filter(NET, eqx.is_array)), []
+
+    @eqx.filter_jit
+    def step(net, memory):
+        value, slope = eqx.filter_value_and_grad(lambda net: loss(net.video(noisy), clean))(net)
+        update, memory = optimiser.update(slope, memory)
+        return value, eqx.apply_updates(net, update), memory
+
+    for _ in range(40):
+        value, net, memory = step(net, memory)
+        values.append(float(value))
+    assert values[-1] < 0.7 * values[0]
+
+
+def test_loss_is_that_of_equation_10():
+    clean, enhanced = jnp.zeros((2, 4, 5, 3)), jnp.ones((2, 4, 5, 3)).at[:, 2:].set(3.0)
+    variation = 2 * 5 * 3  # one step of 2 in each of 5 columns and 3 channels
+    assert float(total_variation(enhanced)) == pytest.approx(variation)
+    expected = 5 * 5.0 + 2.0 + 2e-6 * variation
+    assert float(loss(enhanced, clean)) == pytest.approx(expected)
+    doubled = loss(enhanced, clean, perceptual=lambda frames: 2 * frames)
+    assert float(doubled) == pytest.approx(expected + 0.06 * 4 * 5.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [({"maps": 0}, "maps"), ({"stride": 0}, "stride"), ({"kernels": (3, 4)}, "kernels"), ({"kernels": ()}, "kernels")],
+)
+def test_bad_sizes_are_named(arguments, name):
+    with pytest.raises(ValueError, match=name):
+        STLSTM(KEY, **arguments)
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 4), (8, 8), (1, 8, 8, 1)])
+def test_bad_frames_are_named(shape):
+    with pytest.raises(ValueError, match="frame: expected"):
+        NET(jnp.zeros(shape), NET.init_state((8, 8)))
+
+
+def test_state_of_another_size_is_named():
+    with pytest.raises(ValueError, match="state: made for"):
+        NET(jnp.zeros((8, 8, 3)), NET.init_state((8, 10)))
+    with pytest.raises(ValueError, match="frame 1 has shape"):
+        list(enhance(NET, [np.zeros((8, 8, 3)), np.zeros((8, 9, 3))]))
