@@ -1,42 +1,50 @@
-"""Dark captures drawn from a model, like a given one: same exposures, frames, shape and sensor in all exposures."""
+"""Captures drawn from a model, like a given one: same exposures, frames, shape and light, one sensor."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
 
 from hsnoise._keys import named_key
+from hsnoise._types import cfa_tile
 from hsnoise.effects import Stage
-from hsnoise.model import NoiseModel, dark_signals, sample_dark_by_effect
+from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 from hsnoise.stack import FrameStack
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
+SURFACE_DEGREE = 3  # of the light on flats
 FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
 
 
 def darks_of(stack: FrameStack) -> FrameStack:
-    """The dark exposures of a stack, in memory, cut to what can be drawn many times.
+    """The dark exposures of a stack, cut as `part_of` does. Raises ValueError without darks."""
+    return part_of(stack, kinds=("dark",))
+
+
+def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> FrameStack:
+    """The exposures of a stack, in memory, cut to what can be drawn many times.
 
     Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without darks.
     """
-    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-    if not darks:
+    if "dark" not in stack.kind:
         raise ValueError("stack: expected dark frames, got flats only")
+    chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
     rows, columns = stack.shape
-    per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(darks) * rows * columns))
-    frames = sum(min(stack.n_frames[i], per_exposure) for i in darks)
+    per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(chosen) * rows * columns))
+    frames = sum(min(stack.n_frames[i], per_exposure) for i in chosen)
     kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
     first = 0
     if kept < columns:
         first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
-    part = stack.select(frames=slice(0, per_exposure), exposures=darks, columns=(first, min(first + kept, columns)))
+    part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, min(first + kept, columns)))
     counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
     return FrameStack(counts, **_like(part))
 
@@ -81,21 +89,43 @@ def black_level_of(model: NoiseModel) -> np.ndarray:
 
 
 def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
-    """Darks drawn from `model` as `like` was taken: one sensor, every frame new."""
+    """A capture drawn from `model` as `like` was taken: one sensor, every frame new, flats in light as bright."""
     key = jax.random.key(seed)
     sensor_key = named_key(key, "sensor")
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
         own = jax.random.fold_in(named_key(key, "frames"), e)
-        drawn = sample_dark_by_effect(
-            own, frames, like.shape, model, exposure_s=float(exposure_s), sensor_key=sensor_key
-        )
+        clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
+        drawn = sample_by_effect(own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key)
         counts.append(np.asarray(drawn))
     return FrameStack(counts, **_like(like))
 
 
+def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
+    """Expected photoelectrons [row, column] at which `model` gives an exposure of `like` its mean; 0 in darks."""
+    if like.kind[exposure] == "dark":
+        return np.zeros(like.shape, np.float32)
+    channel = np.tile(cfa_tile(like.cfa), [n // len(cfa_tile(like.cfa)) for n in like.shape])
+    dark_e = float(model["dark_current"].rate) * like.exposure_s[exposure] if "dark_current" in model else 0.0
+    above_black = _illumination_dn(like, exposure) - black_level_of(model)[channel]
+    return np.maximum(above_black / np.asarray(model["gain"].value)[channel] - dark_e, 0.0).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
+    """Mean of an exposure [row, column], DN, of each plane of the Bayer pattern the smooth part: a cubic surface."""
+    mean = np.mean([frame.astype(np.float32) for frame in like.frames(exposure)], axis=0, dtype=np.float64)
+    step, surface = len(cfa_tile(like.cfa)), np.empty(like.shape)
+    for r, c in np.ndindex(step, step):
+        plane = mean[r::step, c::step]
+        down, across = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n), SURFACE_DEGREE) for n in plane.shape)
+        coefficients = np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T
+        surface[r::step, c::step] = down @ coefficients @ across.T
+    return surface
+
+
 def _like(stack: FrameStack) -> dict[str, Any]:
-    keep = ("exposure_s", "white_level", "cfa", "shutter")
+    keep = ("exposure_s", "white_level", "cfa", "shutter", "kind")
     return {name: getattr(stack, name) for name in keep}
 
 

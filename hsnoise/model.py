@@ -239,27 +239,20 @@ def sample_dark(
     return sample(key, clean, params, exposure_s=exposure_s, sensor_key=sensor_key)
 
 
-def sample_dark_by_effect(
-    key: RandomKey,
-    n_frames: int,
-    shape: tuple[int, int],
-    params: NoiseModel,
-    *,
-    exposure_s: float | Scalar,
-    sensor_key: RandomKey,
+def sample_by_effect(
+    key: RandomKey, clean: ArrayLike, params: NoiseModel, *, exposure_s: float | Scalar, sensor_key: RandomKey
 ) -> Array:
-    """As `sample_dark`, the same counts up to rounding, but each effect is compiled by itself.
+    """As `sample` of [frame, row, column], the same counts up to rounding, but each effect is compiled by itself.
 
     Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
     """
-    clean = np.zeros((n_frames, *shape), np.float32)
     return _apply(key, *_prepared(key, clean, params, exposure_s, sensor_key))
 
 
 def dark_signals(
     key: RandomKey, n_frames: int, shape: tuple[int, int], params: NoiseModel, *, exposure_s: float | Scalar
 ) -> Iterator[tuple[AbstractEffect, Array]]:
-    """What leaves each effect in turn when `sample_dark_by_effect` draws, [frame, row, column]."""
+    """What leaves each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.zeros((n_frames, *shape), np.float32)
     return _signals(key, *_prepared(key, clean, params, exposure_s, None))
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import Coordinates, coordinates_for
-from hsnoise.draws import black_level_of, darks_of, draw_capture, floored_variance, in_threads
+from hsnoise.draws import black_level_of, draw_capture, floored_variance, in_threads, part_of
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics
@@ -77,7 +77,7 @@ def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
 class Problem:
     """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained)."""
 
-    darks: FrameStack
+    part: FrameStack
     base: FitResult
     model: NoiseModel
     extra: tuple[str, ...]
@@ -119,7 +119,7 @@ class Problem:
 
     @cached_property
     def coding(self):
-        return coding_of(self.darks)
+        return coding_of(self.part)
 
     @cached_property
     def centre_physics(self) -> Physics:
@@ -128,7 +128,7 @@ class Problem:
 
     @cached_property
     def rules(self):
-        return plan_rules(self.centre_physics, summarise(self.darks, coding=self.coding), MARGIN)
+        return plan_rules(self.centre_physics, summarise(self.part, coding=self.coding), MARGIN)
 
     @property
     def start(self) -> np.ndarray:
@@ -165,10 +165,10 @@ class Problem:
             model = model.with_value(knob.effect, knob.field, moved)
         return model
 
-    def statistics(self, darks: FrameStack) -> tuple[np.ndarray, np.ndarray]:
+    def statistics(self, part: FrameStack) -> tuple[np.ndarray, np.ndarray]:
         """Score in whitened units and structure, one after the other, and a rough error of each."""
-        found = structure(darks, black_level_of(self.base.params))
-        summary = summarise(darks, coding=self.coding)
+        found = structure(part, black_level_of(self.base.params))
+        summary = summarise(part, coding=self.coding)
         with jax.enable_x64(True):
             rules = replan(self.rules, plan_rules(self.centre_physics, summary, MARGIN))
             _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
@@ -176,7 +176,7 @@ class Problem:
         return np.concatenate([score, found.values]), np.concatenate([np.full(len(score), 0.3), found.error])
 
     def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-        return self.statistics(draw_capture(self.seed + number, self.at(y), self.darks))
+        return self.statistics(draw_capture(self.seed + number, self.at(y), self.part))
 
 
 def _in_float64(problem: Problem, y: np.ndarray) -> NoiseModel:
@@ -189,13 +189,13 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
 
     base: fit of the same capture without those effects. model: its values are where the search for the effects starts.
     """
-    darks, tick = darks_of(stack), progress or (lambda: None)
+    part, tick = part_of(stack), progress or (lambda: None)
     extra = tuple(name for name in model.names if name not in base.params)
     whole = base.params
     for name in extra:
         whole = whole.add(model[name])
-    problem = Problem(darks, base, whole, extra, knobs(whole, extra), seed)
-    measured, _ = problem.statistics(darks)
+    problem = Problem(part, base, whole, extra, knobs(whole, extra), seed)
+    measured, _ = problem.statistics(part)
     y, n = problem.start, len(problem.centre)
     scale, weight = _weights(problem, y, tick)
     prior = problem.prior

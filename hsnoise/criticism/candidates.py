@@ -1,4 +1,4 @@
-"""What may be missing: built-in effects at amplitudes that a dark capture may show, their details drawn at random.
+"""What may be missing: built-in effects at amplitudes that a capture may show, their details drawn at random.
 
 An amplitude of 1 is a modest effect; details that a user cannot know (period, corner, number of taps) vary from draw
 to draw, so that an effect is recognised whatever they are.
@@ -12,9 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise import effects as fx
+from hsnoise.draws import light_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
+
+LEAST_ELECTRONS = 0.2
 
 Maker = Callable[[float, np.random.Generator], AbstractEffect]
 
@@ -29,24 +32,27 @@ class Scale:
     gain: np.ndarray
     frames: int
     has_exposure: bool
+    light: float  # most photoelectrons of a flat, e-
 
     @staticmethod
-    def of(model: NoiseModel, darks: FrameStack) -> Scale:
-        longest = float(max(darks.exposure_s))
+    def of(model: NoiseModel, part: FrameStack) -> Scale:
+        darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
+        longest = float(max(part.exposure_s[i] for i in darks))
         return Scale(
             read_noise=float(model["read_noise"].sigma),
             longest_s=max(longest, 1e-9),
             rate=float(model["dark_current"].rate) if "dark_current" in model else 0.0,
             gain=np.asarray(model["gain"].value, float),
-            frames=max(darks.n_frames),
+            frames=max(part.n_frames[i] for i in darks),
             has_exposure=longest > 0,
+            light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
         )
 
 
-def built_in(model: NoiseModel, darks: FrameStack) -> dict[str, Maker]:
-    """Effects that darks can show and that the model does not have: name to a maker from amplitude and generator."""
-    scale = Scale.of(model, darks)
-    makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, darks.shutter)}
+def built_in(model: NoiseModel, part: FrameStack) -> dict[str, Maker]:
+    """Effects that a capture can show and that the model does not have: name to maker from amplitude and generator."""
+    scale = Scale.of(model, part)
+    makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, part.shutter), **_of_signal(scale)}
     if scale.has_exposure:
         makers |= _dark_signal(scale)
     if scale.frames < 2:
@@ -122,12 +128,24 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
         "cosmic_rays": cosmic,
         "dark_current_drift": lambda f, rng: fx.DarkCurrentDrift(0.5 * f * s.read_noise / (s.longest_s * s.frames)),
     }
-    if s.rate * s.longest_s > 0.2:
+    if s.rate * s.longest_s > LEAST_ELECTRONS:
         level = s.gain * s.rate
-        electrons = s.rate * s.longest_s + 2 * s.read_noise
         makers["black_clamp"] = lambda f, rng: fx.BlackClamp(level * min(0.7 * f, 1.0))
-        makers["nonlinearity"] = lambda f, rng: fx.Nonlinearity(0.08 * f / electrons)
-        makers["image_lag"] = lambda f, rng: fx.ImageLag(min(0.03 * f, 0.5))
+    return makers
+
+
+def _of_signal(s: Scale) -> dict[str, Maker]:
+    """What needs electrons, of light or of long darks."""
+    electrons = max(s.rate * s.longest_s, s.light)
+    if electrons <= LEAST_ELECTRONS:
+        return {}
+    makers: dict[str, Maker] = {
+        "nonlinearity": lambda f, rng: fx.Nonlinearity(0.08 * f / (electrons + 2 * s.read_noise)),
+        "image_lag": lambda f, rng: fx.ImageLag(min(0.03 * f, 0.5)),
+    }
+    if s.light > 0:
+        noise = np.sqrt(s.light + s.read_noise**2) / s.light
+        makers["photo_response_nonuniformity"] = lambda f, rng: fx.PhotoResponseNonuniformity(0.3 * f * noise)
     return makers
 
 

@@ -24,7 +24,7 @@ def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> 
     model = bench.model
     if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
         return None
-    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(bench.darks.exposure_s) == 0:
+    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(bench.part.exposure_s) == 0:
         return None
     try:
         clamped = fit(fitted.summary, model=model.add(BlackClamp(0.0)))
@@ -34,8 +34,8 @@ def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> 
     score = clamped.log_likelihood - fitted.log_likelihood - parameters
     if not score > 0 or not np.any(np.asarray(clamped.params[CLAMP].rate)):
         return None
-    own = reference(clamped.params, bench.darks, DRAWS, bench.seed, bench.tick)
+    own = reference(clamped.params, bench.part, DRAWS, bench.seed, bench.tick)
     law = shrunk(own.own_z(), np.zeros((1, len(own.mean))))
-    z = own.z(measure(bench.darks, clamped.params).values)
+    z = own.z(measure(bench.part, clamped.params).values)
     misfit = max(law.normal_scores(z, own.groups).values())
     return Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise.criticism.reference import measure, misfits, reference
-from hsnoise.draws import check_effects, check_fits, darks_of
+from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.stack import as_stack
@@ -65,7 +65,7 @@ class Comparison:
 
 
 def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, progress=None, **keywords) -> Comparison:
-    """Compare a model with measured dark frames, statistic by statistic, against the model's own draws.
+    """Compare a model with measured frames, darks and flats, statistic by statistic, against the model's own draws.
 
     Args:
         params: any NoiseModel, fitted or from a file.
@@ -80,10 +80,10 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         raise ValueError(f"draws: expected at least 8, got {draws}")
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
-    darks = darks_of(stack)
-    check_effects(params, darks)
-    measured = measure(darks, params)
-    own = reference(params, darks, draws, seed, progress or (lambda: None))
+    part = part_of(stack)
+    check_effects(params, part)
+    measured = measure(part, params)
+    own = reference(params, part, draws, seed, progress or (lambda: None))
     z = own.z(measured.values)
     groups = misfits(z, own.groups)
     worst = max(groups.values())
@@ -95,7 +95,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         table=tuple((name, group, float(a), float(b), float(c)) for name, group, a, b, c in table),
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
-        log_likelihood_per_pixel=_per_pixel(params, darks),
+        log_likelihood_per_pixel=_per_pixel(params, darks_of(stack)),
         skipped=measured.skipped,
     )
 

@@ -24,7 +24,7 @@ from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined
-from hsnoise.draws import check_effects, check_fits, darks_of
+from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
@@ -109,7 +109,7 @@ def diagnose(
 
     Args:
         fit: result of `hsnoise.fit` on this capture, or one like it (a NoiseModel is taken, too).
-        stack: FrameStack, or a bare array with FrameStack's keywords; its dark frames are used.
+        stack: FrameStack, or a bare array with FrameStack's keywords; darks, and flats if there are any.
         candidates: effects of your own, ready-made instances, that take part beside the built-in ones.
         draws: captures drawn from the fitted model; seed: of all draws.
         progress: called with no argument after each capture that is drawn.
@@ -125,14 +125,14 @@ def diagnose(
         raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
     check_fits(model, stack)
     own = _own(candidates, model)
-    darks = darks_of(stack)
-    check_effects(model, darks)
+    part = part_of(stack)
+    check_effects(model, part)
     for maker in own.values():
-        check_effects(model.add(made(maker, 1.0, 0)), darks)
-    makers = {name: maker for name, maker in built_in(model, darks).items() if name not in own}
-    bench = Bench(model, darks, reference(model, darks, draws, seed, tick), seed, tick)
+        check_effects(model.add(made(maker, 1.0, 0)), part)
+    makers = {name: maker for name, maker in built_in(model, part).items() if name not in own}
+    bench = Bench(model, part, reference(model, part, draws, seed, tick), seed, tick)
     null = shrunk(bench.base.own_z(), bench.slopes())
-    z = bench.base.z(measure(darks, model).values)
+    z = bench.base.z(measure(part, model).values)
     evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
     pair = None
@@ -217,7 +217,7 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) ->
         verdict = "nothing missing"
     elif first.score <= EVIDENCE or left > allowed:
         verdict = "unexplained"
-    elif first.name in ALIKE:
+    elif first.name in ALIKE and not evidence.has_flats:
         verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
     elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
         verdict, names = "ambiguous", (first.name, second.name)

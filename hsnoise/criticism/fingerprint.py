@@ -57,7 +57,7 @@ class Bench:
     """
 
     model: NoiseModel
-    darks: FrameStack
+    part: FrameStack
     base: Reference
     seed: int
     tick: Callable[[], None]
@@ -100,7 +100,7 @@ class Bench:
 
     def _shift(self, changed: NoiseModel, number: int) -> np.ndarray:
         """Statistics of draw `number` of a changed model less those of the model, of the same random numbers."""
-        values = measure(draw_capture(self.seed + number, changed, self.darks), self.model).values
+        values = measure(draw_capture(self.seed + number, changed, self.part), self.model).values
         return (values - self.base.draws[number]) / self.base.deviation
 
 

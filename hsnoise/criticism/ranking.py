@@ -46,6 +46,10 @@ class Evidence:
     groups: tuple[str, ...]
     candidates: int
 
+    @property
+    def has_flats(self) -> bool:
+        return any(group.startswith("flats") for group in self.groups)
+
     @cached_property
     def nothing(self) -> float:
         """Log density of the capture if nothing is missing."""

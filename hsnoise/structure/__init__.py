@@ -34,20 +34,33 @@ class Structure:
     skipped: tuple[str, ...]
 
 
+# What flats tell whatever the light: neither its level, its flicker nor its shape.
+FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
+
+
 def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
-    """The statistics of the dark exposures of a stack.
+    """The statistics of the exposures of a stack, darks and flats apart.
 
     Exposures are averaged over the shorter half ("low") and the longer half ("high") of the exposure times. A single
     exposure gives averages over all its frames; what persists is then compared between its even and odd frames.
 
     Args:
-        stack: the capture; flats are not used.
+        stack: the capture.
         black_level_dn: black level [channel] or a scalar, DN.
 
     Raises:
         ValueError: no dark exposure, or frames smaller than 32 x 32 pixels.
     """
     layout = layout_of(stack)
+    entries = _entries(stack, layout, black_level_dn)
+    if "flat" in stack.kind:
+        lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
+        entries |= {(f"flats, {group}", what): e for (group, what), e in lit.items() if group in FLAT_GROUPS}
+    return _ordered(entries, layout)
+
+
+def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> dict[tuple[str, str], Entry]:
+    """Statistics of the exposures of a layout by (group, what)."""
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("low", "high") if n > 1 else ("even", "odd")
@@ -68,8 +81,7 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
         entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(capture.views), 0.15)
     if max(layout.frames) > 2:
         entries |= _views.outlier_counts(capture.outliers)
-    entries |= _curvature(capture.exposures, layout)
-    return _ordered(entries, layout)
+    return entries | _curvature(capture.exposures, layout)
 
 
 @dataclass

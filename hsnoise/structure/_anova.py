@@ -71,11 +71,11 @@ class Exposure:
         return self.residual.shape
 
 
-def layout_of(stack: FrameStack) -> Layout:
-    """Which exposures, frames and pixels of a stack are used, and sentences on what is not."""
-    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-    darks.sort(key=lambda i: stack.exposure_s[i])
-    if not darks:
+def layout_of(stack: FrameStack, kind: str = "dark") -> Layout:
+    """Which exposures of a kind, frames and pixels of a stack are used, and sentences on what is not."""
+    chosen = [i for i, one in enumerate(stack.kind) if one == kind]
+    chosen.sort(key=lambda i: stack.exposure_s[i])
+    if not chosen:
         raise ValueError("structure: expected at least one dark exposure, got none; its statistics are of dark frames")
     if min(stack.shape) < 32:
         raise ValueError(
@@ -83,13 +83,13 @@ def layout_of(stack: FrameStack) -> Layout:
         )
     rows, columns = _central(stack.shape)
     most = max(FEWEST_FRAMES, MOST_PIXELS // ((rows.stop - rows.start) * (columns.stop - columns.start)))
-    frames = tuple(min(stack.n_frames[i], most) for i in darks)
+    frames = tuple(min(stack.n_frames[i], most) for i in chosen)
     skipped = []
     if (rows.stop - rows.start, columns.stop - columns.start) != stack.shape:
         skipped.append(f"Only rows {rows.start} to {rows.stop} and columns {columns.start} to {columns.stop} are used.")
-    if any(n < stack.n_frames[i] for n, i in zip(frames, darks, strict=True)):
+    if any(n < stack.n_frames[i] for n, i in zip(frames, chosen, strict=True)):
         skipped.append(f"Only the first {most} frames of each exposure are used.")
-    return Layout(stack.cfa, tuple(darks), stack.exposure_s[darks], frames, rows, columns, tuple(skipped))
+    return Layout(stack.cfa, tuple(chosen), stack.exposure_s[chosen], frames, rows, columns, tuple(skipped))
 
 
 def _central(shape: tuple[int, int]) -> tuple[slice, slice]:
