@@ -27,7 +27,8 @@ from hsnoise.statistics import coding_of, summarise, without_counts
 from hsnoise.structure import structure
 
 COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
-ITERATIONS = 3
+LEAST_ITERATIONS, MOST_ITERATIONS = 3, 8
+SHORT_STEP, LONG_STEP = 1.0, 3.0  # standard errors: where the search ends, and where it has failed
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of a base coordinate, mostly a logarithm, from which it is unknown
@@ -199,7 +200,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     y, n = problem.start, len(problem.centre)
     scale, weight = _weights(problem, y, tick)
     prior = problem.prior
-    for _ in range(ITERATIONS):
+    for iteration in range(1, MOST_ITERATIONS + 1):
         drawn, slopes = _draws_and_slopes(problem, y, tick)
         mean, slopes = drawn.mean(0), slopes / scale[:, None]
         information = slopes.T @ weight @ slopes + np.diag(prior)
@@ -207,16 +208,21 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
         step = np.linalg.solve(information, gain @ ((measured - mean) / scale) - prior * (y - problem.start))
         longest = np.abs(step[n:]).max(initial=0.0)
         y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
-    covariance = _as_scattered(np.linalg.inv(information), gain, (drawn - mean) / scale)
-    return _result(problem, y, covariance, float(np.abs(step / np.sqrt(np.diagonal(covariance))).max()))
+        covariance = np.linalg.inv(information)
+        last_step = float(np.abs(step / np.sqrt(np.diagonal(covariance))).max())
+        if iteration >= LEAST_ITERATIONS and last_step < SHORT_STEP:
+            break
+    covariance = _as_scattered(covariance, gain, (drawn - mean) / scale)
+    return _result(problem, y, covariance, last_step, iteration)
 
 
-def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float) -> FitResult:
+def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float, iterations: int) -> FitResult:
     n, base = len(problem.centre), problem.base
     coordinate = problem.centre + problem.whiten @ y[:n]
     turn = np.zeros((len(y), len(y)))
     turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
     turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
+    met = "simulated statistics met" if last_step < LONG_STEP else "NOT CONVERGED: simulated statistics not met"
     return replace(
         base,
         params=_in_float64(problem, y),
@@ -224,8 +230,8 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         names=(*base.names, *(knob.label for knob in problem.knobs)),
         covariance=_not_surer_than(base.covariance, turn @ covariance @ turn.T),
         method="synthetic",
-        outcome=f"simulated statistics met: the last step was {last_step:.1g} standard errors long",
-        iterations=ITERATIONS,
+        outcome=f"{met}: the last step was {last_step:.1g} standard errors long",
+        iterations=iterations,
         log_likelihood=float("nan"),
         notes=_notes(problem, covariance),
     )

@@ -208,7 +208,9 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) ->
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
     names: tuple[str, ...] = (first.name,)
     left = first.misfit
-    if pair is not None and pair.score > first.score + EVIDENCE and pair.misfit < min(left, allowed):
+    # A second effect is told if the first leaves more than it may, or if the two leave nothing.
+    limit = min(left, allowed if left > allowed else MISFIT_LEFT)
+    if pair is not None and pair.score > first.score + EVIDENCE and pair.misfit < limit:
         left, names = pair.misfit, pair.names
         ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
         first = ranking[0]

@@ -24,6 +24,7 @@ from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
 MOST_STEPS = 6
+MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 HELD_OUT_DRAWS = 40
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
@@ -137,23 +138,29 @@ def improve(
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)
         steps[-1] = last = replace(last, diagnosis=found)
         nearest = _nearest(found)
-        if nearest is None:
+        if not nearest:
             return Story(tuple(steps), _end(found, last.comparison))
-        say(f"Adding {nearest.name}")
-        result = _with_one_more(steps, nearest.effect, fitted)
-        step = _step(result, fitted, held_out, nearest.name, last, seed, say)
-        if step.held_out - last.held_out < WORSE or step.comparison.error > last.comparison.error:
-            reason = f"{nearest.name} was tried, but held-out frames or statistics fit worse with it: it was left out"
+        for candidate in nearest:
+            say(f"Adding {candidate.name}")
+            result = _with_one_more(steps, candidate.effect, fitted)
+            step = _step(result, fitted, held_out, candidate.name, last, seed, say)
+            better = step.held_out - last.held_out > WORSE or np.isnan(step.held_out)
+            if better and step.comparison.error <= last.comparison.error:
+                steps.append(step)
+                break
+        else:
+            tried = " and ".join(candidate.name for candidate in nearest)
+            reason = f"{tried} was tried, but held-out frames or statistics fit worse with it: it was left out"
             return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
-        steps.append(step)
 
 
-def _nearest(found: Diagnosis) -> Candidate | None:
-    """What to add: the effect that is named, or else the one that explains most of what no effect explains alone."""
-    if found.best is not None or found.verdict == "nothing missing":
-        return found.best
-    first = found.ranking[0]
-    return first if first.score > EVIDENCE else None
+def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
+    """What to try: the effect that is named, or else those that explain most of what none explains alone."""
+    if found.best is not None:
+        return (found.best,)
+    if found.verdict == "nothing missing":
+        return ()
+    return tuple(one for one in found.ranking[:MOST_TRIED] if one.score > EVIDENCE)
 
 
 def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack) -> FitResult:
