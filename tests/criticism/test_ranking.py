@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from hsnoise import effects as fx
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.gaussian import Gaussian
-from hsnoise.criticism.ranking import Evidence, best_pair, judge
+from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pair, judge
+
+decide = importlib.import_module("hsnoise.criticism.diagnose")._verdict  # the package has a function of that name
 
 STATISTICS, AMPLITUDES = 40, (0.35, 1.0, 2.5)
 NAMES = tuple(f"statistic {i}" for i in range(STATISTICS))
@@ -54,3 +60,36 @@ def test_two_effects_are_found_together():
     pair = best_pair(judged, found)
     assert set(pair.names) == {"left", "right"} and pair.misfit < 3 and pair.score > judged[0].score + 10
     assert best_pair(judged[:1], found) is None
+
+
+def verdict(left: float, pair: Pair | None, worst: float = 20.0):
+    """The verdict on a capture whose worst group is `worst` off and of which the first candidate leaves `left`."""
+    rows = [("left", 400.0, left), ("middle", 90.0, 15.0), ("right", 20.0, 18.0)]
+    ranking = [Candidate(name, fx.RowNoise(1.0), score, 1e-9, misfit) for name, score, misfit in rows]
+    z = np.zeros(STATISTICS)
+    z[:10] = (1 - 2 / 90 + worst * np.sqrt(2 / 90)) ** 1.5  # Wilson and Hilferty, of ten statistics
+    return decide(ranking, pair, replace(evidence(), z=z))
+
+
+@pytest.mark.parametrize(
+    ("left", "pair", "names"),
+    [
+        (2.0, None, ("left",)),
+        (2.0, Pair(("left", "right"), 420.0, 1.0), ("left", "right")),  # the two leave nothing, and less
+        (3.4, Pair(("left", "right"), 420.0, 3.45), ("left",)),  # no less is left
+        (9.0, Pair(("left", "right"), 420.0, 5.0), ()),  # both leave too much
+        (9.0, Pair(("right", "left"), 401.0, 1.0), ()),  # no more evidence than one
+        (9.0, Pair(("left", "right"), 420.0, 1.0), ("left", "right")),
+        (9.0, None, ()),
+    ],
+)
+def test_names_of_a_verdict(left, pair, names):
+    found = verdict(left, pair)
+    assert found.names == names
+    assert found.verdict == ("named" if names else "unexplained")
+    assert found.headline == (f"missing: {' and '.join(names)}" if names else "unexplained")
+
+
+def test_a_strong_effect_may_leave_more_but_not_much():
+    assert verdict(5.0, None, worst=200.0).verdict == "named"
+    assert verdict(12.0, None, worst=2000.0).verdict == "unexplained"
