@@ -137,6 +137,7 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         deviation = np.sqrt(np.diagonal(covariance))
         grown = np.maximum(profile_errors(coordinates, maximum, summary) / deviation, 1.0)
         covariance = covariance * grown[:, None] * grown[None, :]
+        covariance = covariance + _of_hidden_dark_level(covariance, names, maximum.physics, summary)
     kept = [i for i, name in enumerate(names) if not name.startswith("outliers")]  # shares of outliers are nuisances
     result = FitResult(
         params=_model_with(maximum.physics, summary, model),
@@ -151,6 +152,22 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         summary=summary,
     )
     return result.with_notes(closing_notes(result)), maximum.converged
+
+
+def _of_hidden_dark_level(covariance: np.ndarray, names, physics: Physics, summary: Summary) -> np.ndarray:
+    """Covariance of black levels from a dark current within its error of 0.
+
+    What of the mean is black and what is dark signal is open there, and curvature, at the floor, does not see it.
+    """
+    moved = np.zeros(len(names))
+    blacks = [i for i, name in enumerate(names) if name.startswith("black_level")]
+    if blacks and "dark_current.rate" in names and len(summary.exposure_s):
+        i = names.index("dark_current.rate")
+        error = float(np.sqrt(covariance[i, i]))
+        if np.isfinite(error) and physics.dark_current < error:
+            gain = np.hypot(np.asarray(physics.gain), np.sqrt(np.diagonal(covariance)[: np.size(physics.gain)]))
+            moved[blacks] = gain * summary.exposure_s.min() * error
+    return np.outer(moved, moved)
 
 
 def _by_line(summary: Summary, model, outcome: str) -> FitResult:

@@ -67,13 +67,14 @@ def pid_after_a_while(frame, folder):
 
 
 def test_worker_that_is_lost_changes_nothing(counts, cluster, tmp_path):
-    lazy = da.from_array(counts, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, dtype=counts.dtype)
+    lazy = da.from_array(counts, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, meta=counts[:0])
     lost = []
 
     def kill_a_reader():
-        while len(list(tmp_path.iterdir())) < 2:
+        workers = set(cluster.run(os.getpid).values())
+        while not (readers := workers & {int(path.name) for path in tmp_path.iterdir()}):
             time.sleep(0.02)
-        lost.append(int(next(tmp_path.iterdir()).name))
+        lost.append(readers.pop())
         os.kill(lost[0], 9)
 
     killer = threading.Thread(target=kill_a_reader)

@@ -169,7 +169,7 @@ def test_frames_are_read_once_and_one_at_a_time(rng, cfa, kind, ends):
 
     summarise(FrameStack(LazyFrames([read] * 9, (8, 12), np.uint16), 0.1, kind=kind, cfa=cfa))
     assert reads == 9 + ends
-    assert alive == 0 and most == 2  # the one before is let go when the next one has been read
+    assert alive == 0 and most <= 2  # the one before is let go when the next one has been read, at the latest
 
 
 @st.composite
