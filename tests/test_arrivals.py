@@ -108,7 +108,10 @@ SQUARES = {  # of x = gain (Poisson(light + rate t) + sigma z) + black: paramete
 }
 
 
-@pytest.mark.parametrize("name", SQUARES)
+SOME = ["rate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gain", "sigma", "light"))]
+
+
+@pytest.mark.parametrize("name", SOME)
 def test_gradient_of_an_expectation_is_that_of_its_closed_form(name):
     value, closed = SQUARES[name]
 
@@ -124,7 +127,7 @@ def test_gradient_of_an_expectation_is_that_of_its_closed_form(name):
     assert error < 0.01 * abs(found)
 
 
-@pytest.mark.parametrize("name", ["gain", "rate", "sigma", "light"])
+@pytest.mark.parametrize("name", SOME)
 def test_gradient_through_rounding_and_clipping(name):
     """Against finite differences of the exact expectation of counts clipped at 0 and 12."""
     start = {"gain": 1.5, "rate": 20.0, "sigma": 2.0, "light": 1.0}

@@ -52,6 +52,7 @@ def test_summary_is_that_in_memory(counts):
     same(summarise(hsnoise.FrameStack(lazy, **CAPTURE)), summarise(hsnoise.FrameStack(counts, **CAPTURE)))
 
 
+@pytest.mark.slow
 def test_flats_are_summed_on_the_workers(counts, cluster):
     kinds = {"kind": ["dark", "flat"]}
     lazy = da.from_array(counts, chunks=(1, 1, 64, 96))
@@ -66,6 +67,7 @@ def pid_after_a_while(frame, folder):
     return frame
 
 
+@pytest.mark.slow
 def test_worker_that_is_lost_changes_nothing(counts, cluster, tmp_path):
     lazy = da.from_array(counts, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, meta=counts[:0])
     lost = []

@@ -58,6 +58,7 @@ def test_a_frame_depends_on_those_before_not_after():
     assert np.abs(one[2] - other[2]).max() > 1e-5
 
 
+@pytest.mark.slow
 def test_checkpoint_changes_no_gradient():
     frames = jnp.asarray(video(3, (8, 8), batch=2))
 
@@ -68,7 +69,8 @@ def test_checkpoint_changes_no_gradient():
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
 
 
-@settings(max_examples=4, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=6, deadline=None)
 @given(rows=st.integers(1, 13), columns=st.integers(1, 13), stride=st.sampled_from([1, 2, 3]))
 def test_any_size(rows, columns, stride):
     net = STLSTM(KEY, maps=2, kernels=(3,), stride=stride)
@@ -122,6 +124,13 @@ def test_loss_is_that_of_equation_10():
 def test_bad_sizes_are_named(arguments, name):
     with pytest.raises(ValueError, match=name):
         STLSTM(KEY, **arguments)
+
+
+def test_odd_sizes_keep_their_shape():
+    frame = jnp.ones((7, 9, 3))
+    out, state = NET(frame, NET.init_state((7, 9)))
+    assert out.shape == frame.shape and np.isfinite(out).all()
+    assert NET(out, state)[0].shape == frame.shape
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 4), (8, 8), (1, 8, 8, 1)])
