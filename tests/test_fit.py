@@ -103,6 +103,7 @@ def test_numbers_of_exposures_and_frames(exposures, frames):
     assert_recovered(hsnoise.fit(capture(model, exposure_s=exposure_s, frames=frames, shape=(64, 96))), model)
 
 
+@pytest.mark.slow
 def test_ragged_frames_and_single_ones():
     model = hsnoise.cameras.grasshopper3(black_level_dn=64)
     whole = capture(model)
@@ -127,6 +128,7 @@ def assert_gain_not_determined(model, exposure_s, black_level, seed):
     assert any("gain.R is not determined" in note and "flats" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_one_exposure_says_what_it_does_not_determine():
     assert_gain_not_determined(hsnoise.cameras.grasshopper3(black_level_dn=64), 0.0005, "unknown", seed=7)
 
