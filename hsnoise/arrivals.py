@@ -67,7 +67,7 @@ def merged(effects: Sequence[AbstractEffect], regime: Regime) -> tuple[AbstractE
             sigma = effect.sigma
         else:
             rest.append(effect)
-        if sigma is not None or not (effect.adds or isinstance(effect, ReadNoise)):
+        if sigma is not None or not effect.adds:
             rest.extend(effects[i + 1 :])
             break
     return (*effects[:shot], Arrivals(rate, sigma, regime), *rest)

@@ -104,7 +104,7 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
 def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
     """Expected photoelectrons [row, column] at which `model` gives an exposure of `like` its mean; 0 in darks."""
     if like.kind[exposure] == "dark":
-        return np.zeros(like.shape, np.float32)
+        return np.broadcast_to(np.float32(0), like.shape)
     channel = np.tile(cfa_tile(like.cfa), [n // len(cfa_tile(like.cfa)) for n in like.shape])
     dark_e = float(model["dark_current"].rate) * like.exposure_s[exposure] if "dark_current" in model else 0.0
     above_black = _illumination_dn(like, exposure) - black_level_of(model)[channel]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import coordinates_for, labels
-from hsnoise.draws import check_effects, check_fits, darks_of
+from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.line import line_fit
 from hsnoise.maximise import maximise
@@ -98,12 +98,13 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
     stack = as_stack(stack, **keywords)
     check_fits(model, stack)
-    check_effects(model, darks_of(stack))
+    part = part_of(stack)
+    check_effects(model, part)
     bare = model
     for name in extra:
         bare = bare.remove(name)
     base = fit(stack, model=bare, method=method, progress=progress)
-    return fit_synthetic(base, stack, model)
+    return fit_synthetic(base, part, model)
 
 
 def _summary_of(stack, progress) -> Summary:

@@ -235,7 +235,7 @@ def sample_dark(
     sensor_key: RandomKey | None = None,
 ) -> Array:
     """Draw dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`."""
-    clean = np.zeros((n_frames, *shape), np.float32)
+    clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
     return sample(key, clean, params, exposure_s=exposure_s, sensor_key=sensor_key)
 
 
@@ -253,7 +253,7 @@ def dark_signals(
     key: RandomKey, n_frames: int, shape: tuple[int, int], params: NoiseModel, *, exposure_s: float | Scalar
 ) -> Iterator[tuple[AbstractEffect, Array]]:
     """What leaves each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
-    clean = np.zeros((n_frames, *shape), np.float32)
+    clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
     return _signals(key, *_prepared(key, clean, params, exposure_s, None))
 
 
@@ -337,8 +337,10 @@ def _check_clean(clean, cfa: str):
         raise ValueError(f"clean: expected even rows and columns for cfa {cfa}, got {clean.shape[-2:]}.")
     if is_traced(clean):
         return clean, np.nan, np.nan
+    # Broadcast axes (all frames alike, no light at all) hold one number each.
+    some = clean if isinstance(clean, jax.Array) else clean[tuple(slice(1 if s == 0 else None) for s in clean.strides)]
     with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
-        low, high = float(clean.min()), float(clean.max())
+        low, high = float(some.min()), float(some.max())
     if not (low >= 0 and high < np.inf):
         raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
     return clean, low, high

@@ -57,6 +57,16 @@ class Knob:
         value = x if self.low is None else self.low + np.exp(np.clip(x, -25, 25))
         return float(value if self.high is None else min(value, self.high))
 
+    def read(self, model: NoiseModel) -> float:
+        """The unconstrained number in `model`."""
+        return self.forward(float(np.asarray(getattr(model[self.effect], self.field))[self.index]))
+
+    def put(self, model: NoiseModel, x: float) -> NoiseModel:
+        """`model` with this number."""
+        moved = np.array(getattr(model[self.effect], self.field), float)
+        moved[self.index] = self.inverse(x)
+        return model.with_value(self.effect, self.field, moved)
+
     def slope(self, x: float) -> float:
         """d value / d x."""
         return 1.0 if self.low is None else float(np.exp(np.clip(x, -25, 25)))
@@ -133,11 +143,7 @@ class Problem:
 
     @property
     def start(self) -> np.ndarray:
-        own = [
-            knob.forward(float(np.asarray(getattr(self.model[knob.effect], knob.field))[knob.index]))
-            for knob in self.knobs
-        ]
-        return np.concatenate([np.zeros(len(self.centre)), own])
+        return np.concatenate([np.zeros(len(self.centre)), [knob.read(self.model) for knob in self.knobs]])
 
     def physics(self, y: np.ndarray) -> Physics:
         n = len(self.centre)
@@ -161,9 +167,7 @@ class Problem:
             if name in model and value is not None:
                 model = model.with_value(name, field, value)
         for knob, x in zip(self.knobs, y[len(self.centre) :], strict=True):
-            moved = np.array(getattr(model[knob.effect], knob.field), float)
-            moved[knob.index] = knob.inverse(x)
-            model = model.with_value(knob.effect, knob.field, moved)
+            model = knob.put(model, x)
         return model
 
     def statistics(self, part: FrameStack) -> tuple[np.ndarray, np.ndarray]:

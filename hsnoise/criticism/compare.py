@@ -95,7 +95,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         table=tuple((name, group, float(a), float(b), float(c)) for name, group, a, b, c in table),
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
-        log_likelihood_per_pixel=_per_pixel(params, darks_of(stack)),
+        log_likelihood_per_pixel=_per_pixel(params, darks_of(part)),
         skipped=measured.skipped,
     )
 

@@ -11,7 +11,6 @@ from hsnoise.criticism.candidates import Maker, made
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.reference import Reference, measure
 from hsnoise.draws import draw_capture, in_threads
-from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
@@ -78,7 +77,7 @@ class Bench:
         new = [task for task in tasks if task not in self.drawn]
 
         def draw(task: Task) -> np.ndarray:
-            return self.shift_with(made(*task), task[2])
+            return self.shift(self.model.add(made(*task)), task[2])
 
         self.drawn.update(zip(new, in_threads(draw, new, self.tick), strict=True))
         prints = []
@@ -91,14 +90,10 @@ class Bench:
         """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
         moved = _moved_models(self.model)
         tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
-        shifts = in_threads(lambda task: self._shift(*task), tasks, self.tick)
+        shifts = in_threads(lambda task: self.shift(*task), tasks, self.tick)
         return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
 
-    def shift_with(self, effect: AbstractEffect, number: int) -> np.ndarray:
-        """Shift of the statistics [statistic] that the effect makes in draw `number`."""
-        return self._shift(self.model.add(effect), number)
-
-    def _shift(self, changed: NoiseModel, number: int) -> np.ndarray:
+    def shift(self, changed: NoiseModel, number: int) -> np.ndarray:
         """Statistics of draw `number` of a changed model less those of the model, of the same random numbers."""
         values = measure(draw_capture(self.seed + number, changed, self.part), self.model).values
         return (values - self.base.draws[number]) / self.base.deviation

@@ -149,8 +149,8 @@ def improve(
                 steps.append(step)
                 break
         else:
-            tried = " and ".join(candidate.name for candidate in nearest)
-            reason = f"{tried} was tried, but held-out frames or statistics fit worse with it: it was left out"
+            tried = " or ".join(candidate.name for candidate in nearest)
+            reason = f"Adding {tried} was tried, but held-out frames or statistics fit worse with it: it was left out"
             return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
 
 

@@ -8,6 +8,7 @@ from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench
 from hsnoise.criticism.ranking import Evidence
 from hsnoise.draws import in_threads
 from hsnoise.effects import AbstractEffect
+from hsnoise.model import NoiseModel
 from hsnoise.synthetic import Knob, knobs
 
 ITERATIONS = 3
@@ -19,39 +20,33 @@ PRIOR_SIGMA = 1.0
 def refined(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> AbstractEffect:
     """`effect` with the parameters at which its draws come closest to the capture."""
     model = bench.model.add(effect)
-    effect = model[effect.name]  # one value for each channel
     turned = knobs(model, (effect.name,))
-    y = np.array([knob.forward(_value(effect, knob)) for knob in turned])
+    y = np.array([knob.read(model) for knob in turned])
     for _ in range(ITERATIONS):
-        shifts, slopes = _shifts_and_slopes(effect, turned, y, bench)
+        shifts, slopes = _shifts_and_slopes(model, turned, y, bench)
         mean = shifts.mean(0)
         covariance = evidence.null.covariance + np.diag((RELATIVE_ERROR * mean) ** 2 + shifts.var(0, ddof=1))
         weighted = np.linalg.solve(covariance, slopes).T
         information = weighted @ slopes + np.eye(len(y)) / PRIOR_SIGMA**2
         step = np.linalg.solve(information, weighted @ (evidence.z - mean))
         y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    return _at(effect, turned, y)
+    return _at(model, turned, y)[effect.name]
 
 
-def _shifts_and_slopes(effect, turned: list[Knob], y: np.ndarray, bench: Bench) -> tuple[np.ndarray, np.ndarray]:
+def _shifts_and_slopes(
+    model: NoiseModel, turned: list[Knob], y: np.ndarray, bench: Bench
+) -> tuple[np.ndarray, np.ndarray]:
     """Shifts at y [draw, statistic] and their derivatives [statistic, knob], by common random numbers."""
-    moved = [y + STEP * (np.arange(len(y)) == i) for i in range(len(y))]
-    tasks = [(y, number) for number in range(DRAWS)]
+    moved = [_at(model, turned, y + STEP * (np.arange(len(y)) == i)) for i in range(len(y))]
+    tasks = [(_at(model, turned, y), number) for number in range(DRAWS)]
     tasks += [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
-    drawn = np.stack(
-        in_threads(lambda task: bench.shift_with(_at(effect, turned, task[0]), task[1]), tasks, bench.tick)
-    )
+    drawn = np.stack(in_threads(lambda task: bench.shift(*task), tasks, bench.tick))
     shifts = drawn[:DRAWS]
     apart = drawn[DRAWS:].reshape(len(y), SLOPE_DRAWS, -1) - shifts[None, :SLOPE_DRAWS]
     return shifts, apart.mean(1).T / STEP
 
 
-def _value(effect: AbstractEffect, knob: Knob) -> float:
-    return float(np.asarray(getattr(effect, knob.field))[knob.index])
-
-
-def _at(effect: AbstractEffect, turned: list[Knob], y: np.ndarray) -> AbstractEffect:
-    values = {name: np.array(getattr(effect, name), float) for name in effect.specs()}
+def _at(model: NoiseModel, turned: list[Knob], y: np.ndarray) -> NoiseModel:
     for knob, x in zip(turned, y, strict=True):
-        values[knob.field][knob.index] = knob.inverse(x)
-    return type(effect)(**values, **effect.settings())
+        model = knob.put(model, x)
+    return model
