@@ -81,3 +81,16 @@ def _check_within(name: str, value: ArrayLike, high: float = np.inf) -> None:
     value = np.asarray(value)
     if not np.all(np.isfinite(value) & (value >= 0) & (value <= high)):
         raise ValueError(f"{name}: expected finite values in [0, {high}], got {value}.")
+
+
+def linear_from_display(values: ArrayLike) -> Array:
+    """Linear light of display values 0 to 1 (sRGB, IEC 61966-2-1), 0 to 1; straight on below 0."""
+    values = jnp.asarray(values, float)
+    return jnp.where(values <= 0.04045, values / 12.92, ((jnp.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def display_from_linear(light: ArrayLike) -> Array:
+    """Display values (sRGB, IEC 61966-2-1) of linear light, the inverse of `linear_from_display`."""
+    light = jnp.asarray(light, float)
+    low = 0.0031308
+    return jnp.where(light <= low, 12.92 * light, 1.055 * jnp.maximum(light, low) ** (1 / 2.4) - 0.055)

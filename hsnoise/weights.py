@@ -1,0 +1,98 @@
+"""Networks and checkpoints on disk: one line of JSON that says what follows, then the arrays.
+
+Files are written whole or not at all, and a hash tells one that was cut off or changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from hsnoise._output import write_atomically
+from hsnoise.stlstm import STLSTM
+
+FORMAT = "hsnoise arrays 1"
+
+
+def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:
+    """Write the arrays of a PyTree, and what `about` (all that JSON can hold) says of them.
+
+    Raises:
+        OSError: the folder does not exist or is full; an existing file is left as it was.
+    """
+    buffer = io.BytesIO()
+    eqx.tree_serialise_leaves(buffer, tree)
+    content = buffer.getvalue()
+    header = {"format": FORMAT, "sha256": hashlib.sha256(content).hexdigest(), "about": dict(about)}
+    write_atomically(path, json.dumps(header).encode() + b"\n" + content)
+
+
+def read_about(path: str | os.PathLike) -> dict[str, Any]:
+    """What the file of `write_arrays` says of itself.
+
+    Raises:
+        ValueError: for a file that is none, was cut off or changed.
+    """
+    return _read(path)[0]
+
+
+def read_arrays(path: str | os.PathLike, like: Any) -> tuple[Any, dict[str, Any]]:
+    """The PyTree that `write_arrays` wrote, of the structure and shapes of `like`, and what it says of itself.
+
+    Raises:
+        ValueError: for a file that is none, was cut off or changed, or holds arrays of other shapes.
+    """
+    about, content = _read(path)
+    try:
+        return eqx.tree_deserialise_leaves(io.BytesIO(content), like), about
+    except (RuntimeError, EOFError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: holds arrays of another network or optimiser ({_first_line(error)})") from error
+
+
+def _read(path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
+    first, newline, content = Path(path).read_bytes().partition(b"\n")
+    try:
+        header = json.loads(first)
+        known = newline == b"\n" and header["format"] == FORMAT
+    except (ValueError, KeyError, TypeError):
+        known = False
+    if not known:
+        raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise")
+    if hashlib.sha256(content).hexdigest() != header["sha256"]:
+        raise ValueError(f"{path}: cut off or changed since it was written")
+    return header["about"], content
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def save_network(path: str | os.PathLike, net: STLSTM, about: Mapping[str, Any]) -> None:
+    """Write a network with its sizes; `about` says what it was trained for. Raises OSError as `write_arrays`."""
+    write_arrays(path, net, {**about, "network": sizes_of(net)})
+
+
+def load_network(path: str | os.PathLike) -> tuple[STLSTM, dict[str, Any]]:
+    """The network in a file of `save_network`, and what it was trained for.
+
+    Raises:
+        ValueError: for a file that holds no network, or was cut off or changed.
+    """
+    about = read_about(path)
+    if "network" not in about:
+        raise ValueError(f"{path}: holds no network")
+    like = eqx.filter_eval_shape(STLSTM, jax.random.key(0), **about["network"])
+    return read_arrays(path, like)[0], about
+
+
+def sizes_of(net: STLSTM) -> dict[str, Any]:
+    """The arguments that make a network of these sizes."""
+    return {"maps": net.maps, "kernels": list(net.kernels), "stride": net.stride, "channels": net.channels}
