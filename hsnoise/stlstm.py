@@ -119,7 +119,8 @@ class State(eqx.Module):
 class STLSTM(eqx.Module):
     """The enhancer: features of blocks of stride x stride pixels, ST-LSTM layers, and a convolution back to pixels.
 
-    The features, and the frame itself, are added on the way out, so that the layers learn what to change.
+    The features are added on the way out. Frames come in as linear light, in which noise averages out, and leave as
+    display values, in which errors look as large as they are.
 
     Attributes:
         stride: side of the blocks; kernels: kernel size of each layer; maps: feature maps; channels: of a frame.
@@ -142,7 +143,7 @@ class STLSTM(eqx.Module):
         stride: int = 2,
         channels: int = 3,
     ):
-        """Make an untrained network; it returns frames nearly as they are.
+        """Make an untrained network.
 
         Raises:
             ValueError: for sizes below 1 or even kernels.
@@ -155,8 +156,7 @@ class STLSTM(eqx.Module):
         first, last, *rest = jax.random.split(key, 2 + len(kernels))
         self.features = Convolution(first, 3, channels * stride**2, maps)
         self.cells = tuple(Cell(key, kernel, maps) for key, kernel in zip(rest, kernels, strict=True))
-        output = Convolution(last, 3, maps, channels * stride**2)
-        self.output = eqx.tree_at(lambda c: c.weight, output, 0.1 * output.weight)
+        self.output = Convolution(last, 3, maps, channels * stride**2)
         self.maps, self.kernels, self.stride, self.channels = maps, tuple(kernels), stride, channels
 
     def init_state(self, shape: tuple[int, int], batch: int = 1) -> State:
@@ -169,7 +169,7 @@ class STLSTM(eqx.Module):
         """One frame, enhanced, and the state after it.
 
         Args:
-            frame: linear light, [row, column, channel] or [batch, row, column, channel], of any size.
+            frame: linear light, white is 1, [row, column, channel] or [batch, row, column, channel], of any size.
             state: from `init_state` of this size, or after the frame before.
 
         Raises:
@@ -181,14 +181,13 @@ class STLSTM(eqx.Module):
         rows, columns = frames.shape[1:3]
         missing = [(-n) % self.stride for n in (rows, columns)]
         padded = jnp.pad(frames, ((0, 0), (0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
-        features = self.features(to_blocks(padded, self.stride))
+        features = self.features(to_blocks(jnp.arcsinh(padded), self.stride))  # a dim frame's noise is several whites
         x, memory, hidden, cell = features, state.memory, [], []
         for layer, h, c in zip(self.cells, state.hidden, state.cell, strict=True):
             x, c, memory = layer(x, h, c, memory)
             hidden.append(x)
             cell.append(c)
-        change = from_blocks(self.output(x + features), self.stride)
-        out = frames + change[:, :rows, :columns]
+        out = from_blocks(self.output(x + features), self.stride)[:, :rows, :columns]
         return (out[0] if single else out), State(tuple(hidden), tuple(cell), memory)
 
     def _check(self, frames: jax.Array, state: State) -> None:

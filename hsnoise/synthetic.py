@@ -27,8 +27,9 @@ from hsnoise.statistics import coding_of, summarise, without_counts
 from hsnoise.structure import structure
 
 COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
-LEAST_ITERATIONS, MOST_ITERATIONS = 3, 8
-SHORT_STEP, LONG_STEP = 1.0, 3.0  # standard errors: where the search ends, and where it has failed
+MOST_SLOPES, MOST_ITERATIONS = 4, 16  # derivatives cost four times what means do, and change little near the end
+SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
+SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of a base coordinate, mostly a logarithm, from which it is unknown
@@ -203,20 +204,22 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     measured, _ = problem.statistics(part)
     y, n = problem.start, len(problem.centre)
     scale, weight = _weights(problem, y, tick)
-    prior = problem.prior
+    prior, slopes = problem.prior, None
+    last_step, sure = np.inf, False
     for iteration in range(1, MOST_ITERATIONS + 1):
-        drawn, slopes = _draws_and_slopes(problem, y, tick)
-        mean, slopes = drawn.mean(0), slopes / scale[:, None]
-        information = slopes.T @ weight @ slopes + np.diag(prior)
-        gain = slopes.T @ weight
-        step = np.linalg.solve(information, gain @ ((measured - mean) / scale) - prior * (y - problem.start))
+        drawn = _draws(problem, y, tick)
+        if not sure:
+            slopes = _slopes(problem, y, drawn, tick) / scale[:, None]
+            information = slopes.T @ weight @ slopes + np.diag(prior)
+            covariance, gain = np.linalg.inv(information), slopes.T @ weight
+            sure = last_step < SURE_STEP or iteration == MOST_SLOPES
+        step = covariance @ (gain @ ((measured - drawn.mean(0)) / scale) - prior * (y - problem.start))
         longest = np.abs(step[n:]).max(initial=0.0)
         y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
-        covariance = np.linalg.inv(information)
         last_step = float(np.abs(step / np.sqrt(np.diagonal(covariance))).max())
-        if iteration >= LEAST_ITERATIONS and last_step < SHORT_STEP:
+        if sure and last_step < SHORT_STEP:
             break
-    covariance = _as_scattered(covariance, gain, (drawn - mean) / scale)
+    covariance = _as_scattered(covariance, gain, (drawn - drawn.mean(0)) / scale)
     return _result(problem, y, covariance, last_step, iteration)
 
 
@@ -295,17 +298,23 @@ def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndar
     return scale, np.linalg.inv((1 - share) * correlation + share * np.eye(len(scale)) + 0.02 * np.eye(len(scale)))
 
 
-def _draws_and_slopes(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of draws at y [draw, statistic]; their derivatives [statistic, number] by common random numbers."""
-    base = [v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)]
+def _draws(problem: Problem, y: np.ndarray, tick) -> np.ndarray:
+    """Statistics of draws at y [draw, statistic]."""
+    return np.stack([v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)])
+
+
+def _slopes(problem: Problem, y: np.ndarray, drawn: np.ndarray, tick) -> np.ndarray:
+    """Derivatives of the statistics at y [statistic, number], by random numbers common with `drawn`."""
     steps = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
 
     def difference(task: tuple[int, int]) -> np.ndarray:
         which, number = task
         moved = y.copy()
         moved[which] += steps[which]
-        return (problem.draw(moved, number)[0] - base[number]) / steps[which]
+        return (problem.draw(moved, number)[0] - drawn[number]) / steps[which]
 
     tasks = [(which, number) for which in range(len(y)) for number in range(SLOPE_DRAWS)]
     slopes = np.stack(in_threads(difference, tasks, tick)).reshape(len(y), SLOPE_DRAWS, -1)
-    return np.stack(base), slopes.mean(1).T
+    mean, variance = slopes.mean(1), slopes.var(1, ddof=1) / SLOPE_DRAWS
+    # Hundreds of statistics that tell nothing would by their noise pass for information, and make steps too short.
+    return (mean * np.clip(1 - variance / np.maximum(mean**2, 1e-300), 0, 1)).T

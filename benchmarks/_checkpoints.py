@@ -1,0 +1,54 @@
+"""Checkpoints of a training run: the last two are kept, and one that was cut off gives way to the one before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hsnoise.weights import read_arrays, write_arrays
+
+KEPT = 2
+
+
+def path_of(folder: Path, step: int) -> Path:
+    return folder / f"checkpoint-{step:08d}.eqx"
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Those of a folder, newest first."""
+    return sorted(folder.glob("checkpoint-*.eqx"), reverse=True)
+
+
+def write(folder: Path, step: int, tree: Any, about: dict[str, Any]) -> Path:
+    """Write a checkpoint, then remove all but the last two.
+
+    Raises:
+        OSError: the disk is full; the checkpoints before are left as they were.
+    """
+    path = path_of(folder, step)
+    try:
+        write_arrays(path, tree, {**about, "step": step})
+    except OSError as error:
+        raise OSError(
+            error.errno, f"checkpoint not written ({error.strerror}); the last one is intact", str(path)
+        ) from error
+    for old in checkpoints(folder)[KEPT:]:
+        old.unlink()
+    return path
+
+
+def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]] | None:
+    """Tree and description of the newest checkpoint that is whole; None if there is none.
+
+    Raises:
+        ValueError: there are checkpoints, and none can be read.
+    """
+    found = checkpoints(folder)
+    for path in found:
+        try:
+            return read_arrays(path, like)
+        except ValueError as error:
+            say(f"{error}; taking the one before")
+    if found:
+        raise ValueError(f"{folder}: none of its {len(found)} checkpoints can be read; remove them to start anew")
+    return None

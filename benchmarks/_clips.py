@@ -1,0 +1,126 @@
+"""Clean clips to train and test on: folders of videos, or moving crops over scikit-image's pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hsnoise.video import frames_of, is_clip
+
+HELD_OUT_EVERY = 4
+LONG = "_long"  # name of a longer cut of the same video ends so
+STILLS = ("astronaut", "chelsea", "coffee", "hubble_deep_field", "immunohistochemistry", "retina", "rocket")
+MOVING_FRAMES, MOVING_CROP = 12, 192
+FASTEST = 3.0  # pixels a frame
+MOST_FRAMES = 300  # of a clip: longer videos are cut, they would not fit into memory
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clean clip: frames [frame, row, column, 3] of uint8, display values."""
+
+    name: str
+    frames: np.ndarray
+
+    @property
+    def source(self) -> str:
+        """The video that it was cut from."""
+        return self.name.removesuffix(LONG)
+
+
+def read_clips(folder: Path | None) -> list[Clip]:
+    """All clips of a folder, by name; without one, moving crops over scikit-image's pictures.
+
+    Raises:
+        ValueError: no clips in the folder, or one that cannot be read.
+    """
+    if folder is None:
+        return moving_stills()
+    if not folder.is_dir():
+        raise ValueError(f"--clips: expected a folder, got {folder}")
+    paths = [path for path in sorted(folder.iterdir()) if is_clip(path)]
+    if not paths and is_clip(folder):
+        paths = [folder]
+    if not paths:
+        raise ValueError(f"--clips: found no videos, folders of images or .npz files in {folder}")
+    return [Clip(path.stem, _first_frames(path)) for path in paths]
+
+
+def _first_frames(path: Path) -> np.ndarray:
+    frames = []
+    for frame in frames_of(path):
+        frames.append(frame)
+        if len(frames) == MOST_FRAMES:
+            break
+    return np.stack(frames)
+
+
+def held_out(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+    """(to train on, held out): every fourth video in the order of names, with all cuts of it.
+
+    Raises:
+        ValueError: fewer than two videos.
+    """
+    sources = sorted({clip.source for clip in clips})
+    if len(sources) < 2:
+        raise ValueError(f"clips: expected at least two videos, one of them is held out; got {len(sources)}")
+    kept = set(sources[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or sources[-1:])
+    # A longer cut of a video shows nothing new to train on.
+    names = {clip.name for clip in clips}
+    train = [c for c in clips if c.source not in kept and (c.name == c.source or c.source not in names)]
+    return train, [clip for clip in clips if clip.source in kept]
+
+
+def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
+    """Raise ValueError unless every clip has that many frames, and rows and columns of at least `side`."""
+    for clip in clips:
+        n, rows, columns = clip.frames.shape[:3]
+        if n < frames or min(rows, columns) < side:
+            raise ValueError(
+                f"clip {clip.name}: {n} frames of {rows} x {columns}; training takes {frames} frames of {side} x {side}"
+            )
+
+
+def moving_stills(seed: int = 0) -> list[Clip]:
+    """Crops that move over the pictures that come with scikit-image, at a steady speed of up to 3 pixels a frame."""
+    import skimage.data
+
+    rng = np.random.default_rng(seed)
+    clips = []
+    for name in STILLS:
+        picture = np.asarray(getattr(skimage.data, name)())
+        clips.append(Clip(f"still_{name}", _moved(picture, rng)))
+    return clips
+
+
+def _moved(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    side = min(MOVING_CROP, *(n - int(FASTEST * MOVING_FRAMES) - 1 for n in picture.shape[:2]))
+    room = np.array(picture.shape[:2]) - side - 1
+    reach = rng.uniform(-FASTEST, FASTEST, 2) * (MOVING_FRAMES - 1)
+    start = rng.uniform(np.maximum(-reach, 0), np.minimum(room - reach, room))
+    places = np.rint(start + np.linspace(0, 1, MOVING_FRAMES)[:, None] * reach).astype(int)
+    return np.stack([picture[r : r + side, c : c + side] for r, c in places])
+
+
+def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: int, side: int) -> np.ndarray:
+    """Random pieces of random clips, mirrored at random: [batch, frame, row, column, 3] of uint8."""
+    out = np.empty((batch, frames, side, side, 3), np.uint8)
+    for i in range(batch):
+        video = clips[rng.integers(len(clips))].frames
+        first, row, column = (
+            rng.integers(n - size + 1) for n, size in zip(video.shape[:3], (frames, side, side), strict=True)
+        )
+        piece = video[first : first + frames, row : row + side, column : column + side]
+        if rng.integers(2):
+            piece = piece[:, ::-1]
+        if rng.integers(2):
+            piece = piece[:, :, ::-1]
+        if rng.integers(2):
+            piece = piece.swapaxes(1, 2)
+        if rng.integers(2):
+            piece = piece[::-1]
+        out[i] = piece
+    return out

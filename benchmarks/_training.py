@@ -1,0 +1,105 @@
+"""Steps of training: noise drawn on the fly, gradient, Adam. The same step of the same seed is always the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from benchmarks._noisy import Camera, clean_of, jittered, noisy_of
+from hsnoise import NoiseModel
+from hsnoise._keys import named_key
+from hsnoise.photometry import display_from_linear
+from hsnoise.stlstm import STLSTM, loss
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Network and optimiser. decay: the rate falls to 0 by a cosine, as short runs need; else it stays."""
+
+    maps: int = 64
+    kernels: tuple[int, ...] = (3, 5, 5, 3)
+    stride: int = 2
+    rate: float = 1e-3
+    decay: bool = True
+    checkpoint: bool = False
+
+
+def batch_rng(seed: int, step: int) -> np.random.Generator:
+    """Of the crops of one step: a resumed run takes those that an uninterrupted one takes."""
+    return np.random.default_rng([seed, step])
+
+
+class Trainer:
+    """A network, its optimiser, and the jitted step; the state is (arrays of the network, of the optimiser)."""
+
+    def __init__(
+        self, recipe: Recipe, steps: int, camera: Camera, noise: NoiseModel, perceptual: Callable | None = None
+    ):
+        self.recipe, self.camera, self.noise = recipe, camera, noise
+        schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
+        self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        self.sharding = sharding_of_batches()
+        self._step = eqx.filter_jit(partial(_step, self.optimiser, perceptual, recipe.checkpoint), donate="none")
+
+    def start(self, seed: int) -> tuple[STLSTM, Any]:
+        """The untrained network and its optimiser's state."""
+        recipe = self.recipe
+        key = named_key(jax.random.key(seed), "network")
+        net = STLSTM(key, maps=recipe.maps, kernels=recipe.kernels, stride=recipe.stride, channels=self.camera.channels)
+        return net, self.optimiser.init(eqx.filter(net, eqx.is_array))
+
+    def network(self, state: tuple[STLSTM, Any]) -> STLSTM:
+        return state[0]
+
+    def step(self, state: tuple[STLSTM, Any], batch: np.ndarray, seed: int, number: int):
+        """State after one more step, and the loss. batch: display values [batch, frame, row, column, 3], uint8."""
+        key = jax.random.fold_in(named_key(jax.random.key(seed), "noise"), number)
+        if self.sharding is not None and len(batch) % self.sharding.mesh.size == 0:
+            batch = jax.device_put(batch, self.sharding)
+        light = jnp.asarray(self.camera.white_e, jnp.float32)
+        return self._step(state, batch, key, self.camera.model, self.noise, light)
+
+
+def sharding_of_batches() -> jax.sharding.NamedSharding | None:
+    """Examples over all devices; None if there is one."""
+    devices = np.array(jax.devices())
+    if len(devices) == 1:
+        return None
+    return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
+
+
+def _step(optimiser, perceptual, checkpoint, state, batch, key, camera, noise, light):
+    net, memory = state
+    clean, noisy = examples(batch, key, camera, noise, light)
+
+    def value_of(net: STLSTM) -> jax.Array:
+        enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
+        return loss(enhanced, clean, perceptual)
+
+    value, slope = eqx.filter_value_and_grad(value_of)(net)
+    change, memory = optimiser.update(slope, memory)
+    return (eqx.apply_updates(net, change), memory), value
+
+
+def examples(batch, key, camera: NoiseModel, noise: NoiseModel, light) -> tuple[jax.Array, jax.Array]:
+    """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
+
+    Each example has a camera of its own, about 10 % off, and a scene between the photoelectrons of white `light`.
+    """
+    linear = clean_of(batch, len(camera.channels))
+
+    def one(key, linear):
+        of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
+        white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
+        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise), white_e)
+
+    noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
+    return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)

@@ -1,0 +1,83 @@
+"""Features of VGG-16 for the perceptual term of the loss, from the user's weights file.
+
+Reference: Simonyan and Zisserman, "Very deep convolutional networks for large-scale image recognition", ICLR 2015;
+Johnson, Alahi, Fei-Fei, "Perceptual losses for real-time style transfer and super-resolution", ECCV 2016 (relu2_2).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# Places of the convolutions up to relu2_2 in torchvision's `features`, inputs and outputs; a pool follows the second.
+LAYERS = ((0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128))
+POOL_AFTER = 2
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what torchvision's weights expect of display values
+KNOWN = {"397923af": "VGG16_Weights.IMAGENET1K_V1"}  # torchvision puts the hash's start into the file name
+
+
+def read_weights(path: Path) -> tuple[dict[str, np.ndarray], str]:
+    """State dict of torchvision's VGG-16 (.safetensors, or .pth, which needs torch), and SHA-256 of the file.
+
+    Raises:
+        ValueError: an unknown format, or arrays that are missing or of other shapes.
+        ImportError: the library that reads the format is not installed.
+    """
+    if not path.is_file():
+        raise ValueError(f"--vgg: there is no file {path}")
+    if path.suffix == ".safetensors":
+        from safetensors import SafetensorError
+        from safetensors.numpy import load_file
+
+        try:
+            state = load_file(path)
+        except SafetensorError as error:
+            raise ValueError(f"--vgg: {path} cannot be read ({error})") from error
+    elif path.suffix in (".pth", ".pt"):
+        import torch
+
+        state = {name: value.numpy() for name, value in torch.load(path, map_location="cpu", weights_only=True).items()}
+    else:
+        raise ValueError(f"--vgg: expected a .safetensors or .pth file, got {path}")
+    for place, inputs, outputs in LAYERS:
+        for name, shape in (
+            (f"features.{place}.weight", (outputs, inputs, 3, 3)),
+            (f"features.{place}.bias", (outputs,)),
+        ):
+            found = state[name].shape if name in state else "nothing"
+            if found != shape:
+                raise ValueError(f"--vgg: {path}: expected {name} of shape {shape}, got {found}")
+    return state, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def features_of(state: dict[str, np.ndarray]) -> Callable[[jax.Array], jax.Array]:
+    """The function from display values [..., row, column, 3 or 1] to features relu2_2."""
+    layers = [
+        (
+            jnp.asarray(state[f"features.{place}.weight"].transpose(2, 3, 1, 0)),
+            jnp.asarray(state[f"features.{place}.bias"]),
+        )
+        for place, _, _ in LAYERS
+    ]
+
+    def features(frames: jax.Array) -> jax.Array:
+        x = jnp.broadcast_to(frames, (*frames.shape[:-1], 3)).reshape(-1, *frames.shape[-3:-1], 3)
+        x = (x - jnp.array(MEAN)) / jnp.array(DEVIATION)
+        for i, (weight, bias) in enumerate(layers):
+            if i == POOL_AFTER:
+                x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
+            x = jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+            x = jax.nn.relu(x + bias)
+        return x
+
+    return features
+
+
+def name_of(digest: str) -> str:
+    """What is known of a file by its hash."""
+    return KNOWN.get(digest[:8], f"weights of unknown origin, SHA-256 {digest[:8]}")

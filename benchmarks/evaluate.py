@@ -1,0 +1,237 @@
+"""How good is a trained enhancer? PSNR and SSIM on held-out clips, beside what users would take without training.
+
+    python -m benchmarks.evaluate build/train/weights.eqx --clips FOLDER
+
+Writes a table and figures to `--out`: PSNR against illuminance and against frame number, and frames side by side. BM3D
+and BM4D take part if the extra `peers` is installed; BM4D over the frame axis stands for VBM4D, which has no package.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from skimage.metrics import structural_similarity
+
+from benchmarks._clips import LONG, Clip, held_out, read_clips
+from benchmarks._noisy import OPTICS, Camera, camera_of, clean_of, noisy_of
+from benchmarks._rivals import denoised, rivals, tuned
+from benchmarks._validation import psnr_db
+from benchmarks.train import pair
+from hsnoise._output import write_atomically
+from hsnoise.photometry import display_from_linear
+from hsnoise.weights import load_network
+
+LEVELS = 3
+REFER, OURS = "scaled input", "hsnoise ST-LSTM"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A clip in some light: display values and noisy linear light [frame, row, column, channel]."""
+
+    clip: str
+    white_e: float
+    clean: np.ndarray
+    noisy: np.ndarray
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the noise, from frame to frame."""
+        return float(np.sqrt(0.5 * np.mean(np.diff(self.noisy - self.clean, axis=0) ** 2)))
+
+
+def scene_of(clip: Clip, camera: Camera, white_e: float, crop: int, seed: int) -> Scene:
+    side = [min(crop, n) // 2 * 2 for n in clip.frames.shape[1:3]]
+    row, column = ((n - s) // 2 for n, s in zip(clip.frames.shape[1:3], side, strict=True))
+    light = clean_of(clip.frames[:, row : row + side[0], column : column + side[1]], camera.channels)
+    noisy = noisy_of(jax.random.key(seed), light, camera.model, camera.model, white_e)
+    return Scene(clip.name, white_e, np.asarray(display_from_linear(light)), np.asarray(noisy, np.float32))
+
+
+def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
+    """PSNR and SSIM of each frame."""
+    found = np.clip(found, 0, 1)
+    return [
+        {
+            "method": method,
+            "clip": scene.clip,
+            "white_e": scene.white_e,
+            "frame": i,
+            "psnr_db": psnr_db(one, clean),
+            "ssim": float(structural_similarity(one, clean, channel_axis=-1, data_range=1.0)),
+        }
+        for i, (one, clean) in enumerate(zip(found, scene.clean, strict=True))
+    ]
+
+
+def network_of(path: Path, camera: Camera):
+    """The enhancer as a function of a scene. Raises ValueError for weights of another number of channels."""
+    net, about = load_network(path)
+    if net.channels != camera.channels:
+        raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
+    if about.get("camera") != camera.name:
+        print(f"Note: {path} was trained for camera {about.get('camera')}, not {camera.name}")
+    video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
+    return lambda scene: np.asarray(video(scene.noisy))
+
+
+def methods_of(net, tuning: Scene, untrained: bool) -> dict:
+    """Name to function from a scene to display values."""
+    found = {REFER: lambda scene: np.asarray(display_from_linear(scene.noisy)), OURS: net}
+    for name, denoise in rivals().items() if untrained else ():
+        strength, linear = tuned(denoise, tuning.noisy, tuning.clean, tuning.sigma)
+        found[name] = lambda scene, f=denoise, s=strength, linear=linear: denoised(
+            f, scene.noisy, scene.sigma, s, linear
+        )
+        print(f"{name}: best at {strength:g} times the noise, in {'linear light' if linear else 'display values'}")
+    return found
+
+
+def mean_of(records: Sequence[dict], what: str, **chosen) -> float:
+    values = [r[what] for r in records if all(r[name] == value for name, value in chosen.items())]
+    return float(np.mean(values)) if values else float("nan")
+
+
+def tables(records: list[dict], unit_of_light) -> tuple[Table, str]:
+    """PSNR and SSIM of each method: all, and at each illuminance."""
+    methods, levels = list(dict.fromkeys(r["method"] for r in records)), sorted({r["white_e"] for r in records})
+    head = ["method", "PSNR / dB", "SSIM", *(f"PSNR at {unit_of_light(level)}" for level in levels)]
+    rows = [
+        [
+            method,
+            f"{mean_of(records, 'psnr_db', method=method):.2f}",
+            f"{mean_of(records, 'ssim', method=method):.3f}",
+            *(f"{mean_of(records, 'psnr_db', method=method, white_e=level):.2f}" for level in levels),
+        ]
+        for method in methods
+    ]
+    table = Table(*head)
+    for row in rows:
+        table.add_row(*row)
+    clips = list(dict.fromkeys(r["clip"] for r in records))
+    by_clip = [[clip, *(f"{mean_of(records, 'psnr_db', method=m, clip=clip):.2f}" for m in methods)] for clip in clips]
+    return table, "\n\n".join([markdown(head, rows), markdown(["clip, PSNR / dB", *methods], by_clip)]) + "\n"
+
+
+def markdown(head: list[str], rows: list[list[str]]) -> str:
+    lines = [f"| {' | '.join(line)} |" for line in [head, ["---"] * len(head), *rows]]
+    return "\n".join(lines)
+
+
+def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
+    """PSNR against illuminance (all methods) and against frame number (the enhancer, long clips)."""
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    levels = sorted({r["white_e"] for r in records})
+    for method in dict.fromkeys(r["method"] for r in records):
+        values = [mean_of(records, "psnr_db", method=method, white_e=level) for level in levels]
+        left.plot(levels, values, "o-", lw=2.5 if method == OURS else 1.2, label=method)
+    left.set_xscale("log")
+    left.set_xticks(levels, [unit_of_light(level) for level in levels])
+    left.minorticks_off()
+    left.set_xlabel("light of the scene")
+    left.set_ylabel("PSNR (dB)")
+    left.legend(fontsize=8)
+    left.set_title("Against light", loc="left")
+    for clip in dict.fromkeys(r["clip"] for r in long):
+        own = [r for r in long if r["clip"] == clip and r["method"] == OURS]
+        frames = sorted({r["frame"] for r in own})
+        right.plot([f + 1 for f in frames], [mean_of(own, "psnr_db", frame=f) for f in frames], "o-", ms=3, label=clip)
+    right.set_xlabel("frame")
+    right.set_ylabel("PSNR (dB)")
+    right.legend(fontsize=8)
+    right.set_title("Against frame number", loc="left")
+    return figure
+
+
+def draw_frames(scene: Scene, found: dict[str, np.ndarray]) -> Figure:
+    """The last frame of a scene by all methods."""
+    panels = {**found, "clean": scene.clean}
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    aspect = scene.clean.shape[1] / scene.clean.shape[2]
+    figure = Figure(figsize=(3.2 * columns, (3.2 * aspect + 0.35) * rows), layout="constrained")
+    axes = np.ravel(figure.subplots(rows, columns))
+    for axis in axes:
+        axis.axis("off")
+    for axis, (name, frames) in zip(axes, panels.items(), strict=False):
+        axis.imshow(np.clip(frames[-1], 0, 1).squeeze(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        value = "" if name == "clean" else f", {psnr_db(frames[-1], scene.clean[-1]):.1f} dB"
+        axis.set_title(f"{name}{value}", fontsize=10, loc="left")
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    import io
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_atomically(path, buffer.getvalue())
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("weights", type=Path)
+    add("--clips", type=Path, help="the folder that it was trained with; the clips held out then are used")
+    add("--camera", default="canon_5d3", help=f"model.json of a fit, or {', '.join(OPTICS)}")
+    add("--lux", type=pair)
+    add("--white-e", type=pair)
+    add("--crop", type=int, default=160, help="side of the middle of each frame that is scored (default 160)")
+    add("--no-rivals", action="store_true", help="score the enhancer and the scaled input only")
+    add("--out", type=Path, default=Path("build/evaluate"))
+    options = parser.parse_args(argv)
+    try:
+        evaluate(options)
+    except (ValueError, ImportError, OSError) as error:
+        parser.exit(2, f"evaluate: {error}\n")
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    camera = camera_of(options.camera, options.lux, options.white_e)
+    train, kept = held_out(read_clips(options.clips))
+    levels = np.geomspace(*camera.white_e, LEVELS)
+    net = network_of(options.weights, camera)
+    middle = float(levels[LEVELS // 2])
+    methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
+    lux = OPTICS.get(camera.name)
+
+    def unit_of_light(white_e: float) -> str:
+        return f"{white_e:.2g} e-" if lux is None else f"{white_e / float(lux.white_e(1.0)):.2g} lux"
+
+    short = [clip for clip in kept if not clip.name.endswith(LONG)]
+    tasks = [(clip, float(level)) for clip in short for level in levels]
+    records, options.out = [], options.out
+    options.out.mkdir(parents=True, exist_ok=True)
+    for number, (clip, level) in enumerate(track(tasks, "Scoring", console=Console(stderr=True))):
+        scene = scene_of(clip, camera, level, options.crop, number)
+        found = {name: method(scene) for name, method in methods.items()}
+        records += [row for name, frames in found.items() for row in scores(name, scene, frames)]
+        if level == middle:
+            save(draw_frames(scene, found), options.out / f"frames-{clip.name}.png")
+    long = []
+    for number, clip in enumerate(c for c in kept if c.name.endswith(LONG)):
+        scene = scene_of(clip, camera, middle, options.crop, 1000 + number)
+        long += scores(OURS, scene, net(scene))
+    table, text = tables(records, unit_of_light)
+    Console(width=130).print(table)
+    write_atomically(options.out / "evaluation.md", text.encode())
+    save(
+        draw_curves(records, long or [r for r in records if r["method"] == OURS], unit_of_light),
+        options.out / "curves.png",
+    )
+    print(f"Written to {options.out}: evaluation.md, curves.png, frames-*.png")
+
+
+if __name__ == "__main__":
+    main()
