@@ -103,13 +103,13 @@ def noise_of(kind: str, camera: Camera) -> NoiseModel:
     return model
 
 
-def matched(model: NoiseModel, kind: str, light_e: float) -> NoiseModel:
-    """Independent noise of the same variance in each pixel.
+def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: float | None = None) -> NoiseModel:
+    """Independent noise of the same variance in each pixel: that of the model's darks, or `dark_variance_e2`.
 
     "poisson-gaussian": shot noise, and read noise that makes up the variance of darks (so that variance against mean
     is the same line). "gaussian": one variance for all, that at `light_e` photoelectrons.
     """
-    variance_e2 = _dark_variance_e2(model)
+    variance_e2 = _dark_variance_e2(model) if dark_variance_e2 is None else dark_variance_e2
     rate = model["dark_current"].rate if "dark_current" in model else jnp.zeros(())
     dark_e = float(rate) * model.exposure_s
     if kind == "poisson-gaussian":

@@ -60,6 +60,17 @@ class Coordinates(eqx.Module):
         """d parameter / d coordinate, [parameter]."""
         return jnp.diagonal(jax.jacfwd(lambda v: self.flat(self.physics(v)))(vector))
 
+    def sizes(self, vector) -> jax.Array:
+        """How far each coordinate moves when its parameter changes by about itself, [parameter]."""
+        physics, gain = self.physics(vector), jnp.mean(self.base.gain)
+        fixed = {"black_level": gain * self.base.read_noise, "black_clamp": gain * self.base.dark_current + 1e-9}
+        parts = []
+        for name in self.free:
+            value = jnp.atleast_1d(getattr(physics, name))
+            size = jnp.maximum(value / self._scale(name), 1.0) if name in BOUNDED else fixed.get(name, 1.0)
+            parts.append(jnp.broadcast_to(size, value.shape))
+        return jnp.concatenate(parts)
+
     def flat(self, physics: Physics) -> jax.Array:
         """The free parameters of `physics` themselves, in the order of `vector`."""
         return jnp.concatenate([jnp.atleast_1d(getattr(physics, n)) for n in self.free])

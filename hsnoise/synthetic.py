@@ -32,7 +32,7 @@ SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and 
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
-MOST_SPREAD = 0.25  # variance of a base coordinate, mostly a logarithm, from which it is unknown
+MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP = 1.5
 SHRINKAGE = 0.1
 MARGIN = 1.15
@@ -107,16 +107,22 @@ class Problem:
             return np.asarray(self.coordinates.vector(self.coordinates.base))
 
     @cached_property
+    def sizes(self) -> np.ndarray:
+        """What a change of each base coordinate is measured by: as much as doubles the parameter, say."""
+        with jax.enable_x64(True):
+            return np.asarray(self.coordinates.sizes(jnp.asarray(self.centre)))
+
+    @cached_property
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
-        """Variances and directions of the covariance of the base coordinates."""
-        slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12)
+        """Variances and directions of the covariance of the base coordinates over their sizes."""
+        slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12) * self.sizes
         return np.linalg.eigh(self.base.covariance / slope[:, None] / slope[None, :])
 
     @cached_property
     def whiten(self) -> np.ndarray:
         """Square root of the covariance of the base coordinates, directions without information cut to MOST_SPREAD."""
         values, vectors = self.spread
-        return vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
+        return self.sizes[:, None] * vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
 
     @property
     def prior(self) -> np.ndarray:

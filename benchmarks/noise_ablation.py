@@ -1,0 +1,246 @@
+"""Does the better noise model give the better enhancer? On real dark frames, which nobody simulated.
+
+    python -m benchmarks.noise_ablation --clips FOLDER --seeds 2
+
+The same network and steps are trained with (a) independent Gaussian noise of the sensor's variance, (b) shot and read
+noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that after
+`hsnoise.improve`. They are tested on held-out clips whose light, with shot noise, is added to dark frames of the sensor
+that no fit has seen. Everything that is finished is kept in `--out`; the same command goes on.
+
+The sensors are those of a folder outside the project (HSNOISE_SHARED, or ../shared).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import hsnoise
+from benchmarks._clips import LONG, Clip, crops, held_out, read_clips
+from benchmarks._noisy import Camera, clean_of, matched
+from benchmarks._training import Recipe, Trainer, batch_rng
+from benchmarks._validation import psnr_db
+from benchmarks.evaluate import markdown
+from hsnoise import NoiseModel
+from hsnoise._output import write_atomically
+from hsnoise.mosaic import electrons_of
+from hsnoise.photometry import display_from_linear
+from hsnoise.weights import load_network, save_network
+
+NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
+DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame
+BATCH, FRAMES, SIDE, CROP = 4, 8, 32, 128
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A real sensor: the capture to fit, and dark frames [frame, row, column] of one exposure that no fit sees."""
+
+    name: str
+    fitted: hsnoise.FrameStack
+    unseen: np.ndarray
+    exposure_s: float
+
+
+def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
+    def read(name: str):
+        return np.load(folder / f"{name}.npz"), json.loads((folder / f"{name}.json").read_text())["arrays"]
+
+    def stack(data, about, frames: dict[str, slice], white: float) -> hsnoise.FrameStack:
+        return hsnoise.FrameStack(
+            [data[name][part] for name, part in frames.items()],
+            [about[name]["exposure_s"] for name in frames],
+            kind=["flat" if name.startswith("flat") else "dark" for name in frames],
+            white_level=white,
+            shutter="global",
+        )
+
+    def imx541() -> Sensor:
+        # Rows that darks and flats have in common; six of the eight frames of each exposure are fitted.
+        data, about = read("imx541_mono_emva")
+        darks = {n: (slice(6), slice(128)) for n in data.files if n.startswith("dark")}
+        flats = {n: (slice(None), slice(128)) for n in data.files if n.startswith("flat") and data[n].mean() < 1500}
+        # At most 6 ms without light and cooled: the exposures do not differ but in length.
+        unseen = np.concatenate([data[n][6:] for n in darks])
+        return Sensor("imx541", stack(data, about, darks | flats, 4095), unseen, about["dark_000272us"]["exposure_s"])
+
+    def stl1001() -> Sensor:
+        data, about = read("sbig_stl1001_ccd")
+        frames = {n: (slice(5), slice(128)) for n in ("bias_m05C", "dark_m05C_060s")}
+        frames["flat_m05C_023s"] = (slice(None), slice(128))
+        exposure_s = about["dark_m05C_060s"]["exposure_s"]
+        return Sensor("stl1001", stack(data, about, frames, 65535), data["dark_m05C_060s"][5:], exposure_s)
+
+    def tc237() -> Sensor:
+        data, about = read("sbig_st7e_tc237_ccd_clipped")
+        frames = {"bias": (slice(4), slice(494), slice(656)), "flat_006s": (slice(None), slice(494), slice(656))}
+        return Sensor("tc237", stack(data, about, frames, 65535), data["bias"][4:, :494, :656], 0.0)
+
+    return {"imx541": imx541, "stl1001": stl1001, "tc237": tc237}
+
+
+def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
+    """The four noise models, kept as files."""
+    paths = {name: out / f"{sensor.name}-{name}.json" for name in NOISES}
+    if not paths["paper"].exists():
+        print(f"{sensor.name}: fitting")
+        fit = hsnoise.fit(sensor.fitted)
+        print(fit)
+        params = at_exposure(fit.params, sensor.exposure_s)
+        params.save(paths["paper"])
+        light_e = 0.2 * 4 * dark_sigma_e(sensor, params)
+        for name in ("gaussian", "poisson-gaussian"):
+            matched(params, name, light_e, dark_sigma_e(sensor, params) ** 2).save(paths[name])
+    if not paths["improved"].exists():
+        print(f"{sensor.name}: improving")
+        story = hsnoise.improve(sensor.fitted, progress=lambda text: print(f"  {text} ...", flush=True))
+        write_atomically(out / f"{sensor.name}-story.txt", f"{story}\n".encode())
+        at_exposure(story.fit.params, sensor.exposure_s).save(paths["improved"])
+    return {name: NoiseModel.load(path) for name, path in paths.items()}
+
+
+def at_exposure(params: NoiseModel, exposure_s: float) -> NoiseModel:
+    return NoiseModel(params.effects, cfa=params.cfa, shutter=params.shutter, exposure_s=exposure_s)
+
+
+def dark_sigma_e(sensor: Sensor, params: NoiseModel) -> float:
+    """Temporal standard deviation of the fitted darks at the exposure, e-: from differences of frames."""
+    stack = sensor.fitted
+    chosen = int(
+        np.argmin(
+            [
+                abs(t - sensor.exposure_s) + 1e9 * (k != "dark")
+                for t, k in zip(stack.exposure_s, stack.kind, strict=True)
+            ]
+        )
+    )
+    frames = np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
+    # Cosmic rays are rare and huge: the middle of the differences tells of the rest.
+    low, high = np.quantile(np.diff(frames, axis=0), [0.1587, 0.8413])
+    return float((high - low) / 2 / np.sqrt(2) / np.mean(np.asarray(params["gain"].value)))
+
+
+def trained(sensor: Sensor, name: str, models: dict[str, NoiseModel], clips, seed: int, options) -> Path:
+    """Weights of a network that was trained with one of the noises."""
+    path = options.out / f"{sensor.name}-{name}-{seed}.eqx"
+    if path.exists():
+        return path
+    camera = camera_of(sensor, models["paper"])
+    trainer = Trainer(Recipe(maps=options.maps), options.steps, camera, models[name])
+    state = trainer.start(seed)
+    text = f"{sensor.name}, {name}, seed {seed}"
+    for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
+        batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, SIDE)
+        state, value = trainer.step(state, batch, seed, step)
+    save_network(path, trainer.network(state), {"camera": sensor.name, "noise": name, "steps": options.steps})
+    print(f"{text}: loss {float(value):.4f}", flush=True)
+    return path
+
+
+def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
+    sigma = dark_sigma_e(sensor, paper)
+    return Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma))
+
+
+def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Display values and noisy light [frame, row, column, 1]: light and its shot noise on unseen real dark frames.
+
+    As many frames as there are dark ones; a place of the sensor that depends on the seed.
+    """
+    rng = np.random.default_rng(seed)
+    white_e = float(np.exp(rng.uniform(*np.log(camera.white_e))))
+    n = min(len(sensor.unseen), len(clip.frames))
+    side = min(CROP, *sensor.unseen.shape[1:], *clip.frames.shape[1:3])
+    row, column = ((size - side) // 2 for size in clip.frames.shape[1:3])
+    light = np.asarray(clean_of(clip.frames[:n, row : row + side, column : column + side], 1))
+    row, column = (rng.integers(size - side + 1) for size in sensor.unseen.shape[1:])
+    dark = sensor.unseen[rng.permutation(len(sensor.unseen))[:n], row : row + side, column : column + side]
+    gain = float(np.mean(np.asarray(camera.model["gain"].value)))
+    counts = np.rint(dark + gain * rng.poisson(light[..., 0] * white_e))
+    noisy = np.asarray(electrons_of(counts, camera.model)) / white_e
+    return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
+
+
+def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> list[float]:
+    """PSNR, dB, of each clip at each of several places of the sensor."""
+    net, _ = load_network(path)
+    video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
+    values = []
+    for number, clip in enumerate(clips):
+        for place in range(places):
+            clean, noisy = real_scene(sensor, clip, camera, 1000 * number + place)
+            values.append(psnr_db(np.asarray(video(jnp.asarray(noisy))), clean))
+    return values
+
+
+def table_of(results: dict[str, dict[str, list[list[float]]]]) -> tuple[Table, str]:
+    """Mean PSNR of each sensor and noise, and its gain over (b) with a standard error over clips and seeds."""
+    head = ["sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian"]
+    rows = []
+    for sensor, of in results.items():
+        row = [sensor, *(f"{np.mean(of[name]):.2f}" for name in NOISES)]
+        for name in ("paper", "improved"):
+            apart = np.asarray(of[name]) - np.asarray(of["poisson-gaussian"])  # [seed, clip and place]
+            error = np.hypot(apart.mean(0).std(ddof=1) / np.sqrt(apart.shape[1]), between(apart.mean(1)))
+            row.append(f"{apart.mean():+.2f} +- {error:.2f} dB")
+        rows.append(row)
+    table = Table(*head, title="PSNR on real dark frames, dB")
+    for row in rows:
+        table.add_row(*row)
+    return table, markdown(head, rows) + "\n"
+
+
+def between(means: np.ndarray) -> float:
+    """Standard error of the mean over seeds; 0 of one seed, which says nothing of it."""
+    return float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--clips", type=Path)
+    add("--sensors", default="imx541,stl1001,tc237")
+    add("--seeds", type=int, default=2)
+    add("--steps", type=int, default=2000)
+    add("--maps", type=int, default=12)
+    add("--places", type=int, default=3, help="on the sensor, for each clip")
+    add("--out", type=Path, default=Path("build/ablation"))
+    options = parser.parse_args(argv)
+    folder = Path(os.environ.get("HSNOISE_SHARED", "../shared")) / "data"
+    known, asked = sensors(folder), options.sensors.split(",")
+    if not folder.is_dir() or set(asked) - set(known):
+        parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    train, kept = held_out(read_clips(options.clips))
+    kept = [clip for clip in kept if not clip.name.endswith(LONG)]
+    results: dict[str, dict[str, list[list[float]]]] = {}
+    for name in asked:
+        sensor = known[name]()
+        models = models_of(sensor, options.out)
+        camera = camera_of(sensor, models["paper"])
+        of: dict[str, list[list[float]]] = {noise: [] for noise in NOISES}
+        for seed in range(options.seeds):
+            for noise in NOISES:
+                path = trained(sensor, noise, models, train, seed, options)
+                of[noise].append(measured(sensor, path, camera, kept, options.places))
+        results[name] = of
+        table, text = table_of(results)
+        Console(width=130).print(table)
+        write_atomically(options.out / "ablation.md", text.encode())
+        write_atomically(options.out / "ablation.json", json.dumps(results).encode())
+
+
+if __name__ == "__main__":
+    main()
