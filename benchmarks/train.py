@@ -115,11 +115,9 @@ def loop(trainer, state, first, preset, clips, validation, about, options, conso
                     console.print(
                         f"step {done}: loss {float(value):.4f}, PSNR {psnr:.2f} dB (input {validation.refer:.2f})"
                     )
-            if time.monotonic() - saved > CHECKPOINT_S or done == preset.steps or done == options.stop_after:
+            if time.monotonic() - saved > CHECKPOINT_S or done == preset.steps:
                 _checkpoints.write(options.out, done, state, about)
                 saved = time.monotonic()
-            if done == options.stop_after:
-                raise SystemExit(0)
     return state
 
 
@@ -189,7 +187,6 @@ def parser() -> argparse.ArgumentParser:
     add("--steps", type=int, help="instead of the preset's")
     add("--seed", type=int, default=0)
     add("--out", type=Path, default=Path("build/train"), help="default: build/train")
-    add("--stop-after", type=int, help=argparse.SUPPRESS)
     return top
 
 

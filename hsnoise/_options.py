@@ -27,6 +27,7 @@ def parser() -> argparse.ArgumentParser:
     _fit_arguments(commands)
     _loop_arguments(commands)
     _sample_arguments(commands)
+    _enhance_arguments(commands)
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return top
@@ -148,6 +149,21 @@ def _sample_arguments(commands: Any) -> None:
         "--mean-e", type=float, metavar="E", help="scale the clean image to this mean, in photoelectrons"
     )
     sample.add_argument("--seed", type=int, default=0, help="same seed, same frames (default 0)")
+
+
+def _enhance_arguments(commands: Any) -> None:
+    text = (
+        "Enhance a noisy video with a network that `python -m benchmarks.train` trained: of display values (a video "
+        "file or a folder of images), or with --camera of raw frames."
+    )
+    enhance = commands.add_parser("enhance", help="take the noise out of a video", description=text)
+    enhance.add_argument("video", metavar="IN", help="a video file, a folder of images, or raw frames with --camera")
+    enhance.add_argument("out", type=Path, metavar="OUT", help="video file to write: .mp4, .mkv, ...")
+    enhance.add_argument("--weights", type=Path, required=True, metavar="FILE", help="weights.eqx of a training run")
+    enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
+    enhance.add_argument("--brighten", type=float, default=1.0, metavar="X", help="times more light (default 1)")
+    enhance.add_argument("--tile", type=_positive, metavar="PIXELS", help="work in tiles, in less memory, such as 256")
+    enhance.add_argument("--rate", type=float, default=25, help="frames a second of what says none (default 25)")
 
 
 def _numbers(text: str) -> list[float]:

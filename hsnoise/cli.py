@@ -1,4 +1,4 @@
-"""The command line: `hsnoise demo`, `fit`, `compare`, `diagnose`, `improve` and `sample`."""
+"""The command line: `hsnoise demo`, `fit`, `compare`, `diagnose`, `improve`, `sample` and `enhance`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, track
 
 import hsnoise
-from hsnoise import _options, cameras, report
+from hsnoise import _enhance, _options, cameras, report
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically
 from hsnoise._table import table_of
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     try:
         RUN[args.command](args)
-    except (ValueError, TypeError, OSError, RuntimeError) as error:
+    except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
         if args.debug:
             raise
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"hsnoise: {_sentence(error)}", markup=False)
@@ -384,4 +384,5 @@ RUN = {
     "diagnose": _diagnose,
     "improve": _improve,
     "sample": _sample,
+    "enhance": lambda args: _enhance.run(args, None if args.camera is None else _model(args.camera)),
 }

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -130,9 +131,10 @@ def _images(folder: Path) -> Iterator[np.ndarray]:
 
 def _array(path: Path) -> np.ndarray:
     try:
-        content = np.load(path)
-        frames = content["frames"] if path.suffix.lower() == ".npz" else content
-    except (ValueError, OSError, KeyError, EOFError) as error:
+        with open(path, "rb") as file:
+            content = np.load(file)
+            frames = content["frames"] if path.suffix.lower() == ".npz" else content
+    except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise ValueError(f"{path}: expected an array `frames` of video ({error})") from error
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise ValueError(

@@ -1,0 +1,55 @@
+"""Networks on disk."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from hsnoise.stlstm import STLSTM
+from hsnoise.weights import load_network, read_arrays, save_network, write_arrays
+
+NET = STLSTM(jax.random.key(0), maps=2, kernels=(3, 5), stride=2, channels=1)
+
+
+def test_a_network_comes_back_exactly(tmp_path):
+    path = tmp_path / "net.eqx"
+    save_network(path, NET, {"camera": "any"})
+    net, about = load_network(path)
+    for one, other in zip(jax.tree.leaves(net), jax.tree.leaves(NET), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert about["camera"] == "any" and net.kernels == NET.kernels and net.channels == 1
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda c: c[:-7], lambda c: c[:30], lambda c: c[:-1] + b"x", lambda c: b"", lambda c: b"\x00" * 90]
+)
+def test_a_damaged_file_is_told(tmp_path, damage):
+    path = tmp_path / "net.eqx"
+    save_network(path, NET, {})
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match="cut off or changed|not a file of weights"):
+        load_network(path)
+
+
+def test_arrays_of_another_network_are_told(tmp_path):
+    path = tmp_path / "net.eqx"
+    write_arrays(path, NET, {})
+    with pytest.raises(ValueError, match="another network"):
+        read_arrays(path, STLSTM(jax.random.key(0), maps=4, kernels=(3, 5), channels=1))
+    with pytest.raises(ValueError, match="holds no network"):
+        load_network(path)
+
+
+def test_a_failed_write_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+    path = tmp_path / "net.eqx"
+    save_network(path, NET, {})
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save_network(path, NET, {"more": 1})
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
