@@ -6,6 +6,7 @@ import argparse
 import csv
 import io
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -79,7 +80,8 @@ def _sentence(error: Exception) -> str:
     text = " ".join(str(error).split())
     # Users of the command line know its options, not the arguments of the library.
     argument, colon, rest = text.partition(":")
-    return f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
+    text = f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
+    return re.sub(r"\b(\w+)=(?=\W|$|['\"\d])", lambda m: f"{OPTIONS[m[1]]} " if m[1] in OPTIONS else m[0], text)
 
 
 # Commands

@@ -23,6 +23,7 @@ from hsnoise.statistics import Summary, summarise
 from hsnoise.synthetic import fit_synthetic
 
 OUTLIERS_FROM = 1e-4
+SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
 WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
@@ -109,7 +110,29 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
 
 def _summary_of(stack, progress) -> Summary:
     stack.check()
-    return summarise(stack, progress)
+    rows, columns = stack.shape
+    if min(rows, columns) < SMALLEST:
+        raise ValueError(
+            f"counts: a fit needs frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}"
+        )
+    summary = summarise(stack, progress)
+    _check_copies(summary)
+    return summary
+
+
+def _check_copies(summary: Summary) -> None:
+    """Raise ValueError if two frames of an exposure are the same: copies would pass for independent measurements."""
+    for e, n in enumerate(summary.n_frames):
+        sums = [(h.row_sum[e, :n], h.row_sum_of_squares[e, :n]) for h in summary.histograms]
+        frames = np.concatenate([x for pair in sums for x in pair], axis=1)
+        seen: dict[bytes, int] = {}
+        for number, frame in enumerate(frames):
+            first = seen.setdefault(frame.tobytes(), number)
+            if first != number:
+                raise ValueError(
+                    f"counts: frames {first} and {number} of the {summary.exposure_s[e]:g} s exposure are identical;"
+                    " a copy tells nothing of the noise, so give each frame once"
+                )
 
 
 def _check_model(model: NoiseModel) -> bool:

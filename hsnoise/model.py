@@ -116,6 +116,16 @@ class NoiseModel(eqx.Module):
     def _with(self, effects: Iterable[AbstractEffect]) -> NoiseModel:
         return NoiseModel(effects, cfa=self.cfa, shutter=self.shutter, exposure_s=self.exposure_s)
 
+    def __repr__(self) -> str:
+        head = f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
+        try:
+            parameters = self.parameters()
+        except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
+            return head
+        units = {"1": ""}
+        lines = [f"  {p.name} = {p.value:.6g} {units.get(p.spec.unit, p.spec.unit)}".rstrip() for p in parameters]
+        return "\n".join([head, *lines])
+
     def parameters(self) -> list[Parameter]:
         """All numbers of the model with name, value, unit, bounds and meaning."""
         return [parameter for effect in self.effects for parameter in effect.parameters(self.channels)]

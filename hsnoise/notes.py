@@ -11,6 +11,8 @@ UNDETERMINED = 0.3  # relative standard error from which a parameter is called u
 LEAST_OUTLIERS = 5  # pixels; fewer are chance
 MISPLACED_FRACTION = 0.03
 LIGHT_E_PER_S = 2e4  # a dark current above this looks like light
+LIT_SIGMA = 5.0  # standard deviations of a pixel above black that no short dark is
+DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 
 
 def closing_notes(result: FitResult) -> tuple[str, ...]:
@@ -143,9 +145,47 @@ def _order_note(result: FitResult) -> list[str]:
 
 def _light_note(result: FitResult) -> list[str]:
     rate = result.table.get("dark_current.rate", (0.0,))[0]
-    if rate < LIGHT_E_PER_S or not len(result.summary.exposure_s):
+    exposures = result.summary.exposure_s
+    if not len(exposures):
+        return []
+    levels = _levels(result)
+    if len(levels) > 1 and np.ptp(exposures) == 0 and np.ptp(levels) > DRIFT_SIGMA * _noise_dn(result):
+        return [
+            f"All exposures are said to be {exposures[0]:g} s, yet their means differ, from {levels.min():.4g} to"
+            f" {levels.max():.4g} DN: check exposure_s, and whether the sensor warmed up."
+        ]
+    if _is_lit(result, levels):
+        return [
+            f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
+            f" {exposures.max():g} s: if they saw light, they are flats; pass kind='flat'."
+        ]
+    if rate < LIGHT_E_PER_S:
         return []
     return [
         f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
         " pass kind='flat'."
     ]
+
+
+def _levels(result: FitResult) -> np.ndarray:
+    """Mean count of the darks [exposure], DN, over all channels."""
+    total = sum(h.row_sum.sum((1, 2)) for h in result.summary.histograms)
+    return total / np.maximum(sum(h.counts.sum((1, 2, 3), dtype=np.float64) for h in result.summary.histograms), 1)
+
+
+def _noise_dn(result: FitResult) -> float:
+    """Standard deviation within the rows of the darks, DN, the smallest of all exposures."""
+    h = result.summary.histograms[0]
+    pixels = np.maximum(h.row_pixels, 1)
+    variance = h.row_sum_of_squares / pixels - (h.row_sum / pixels) ** 2
+    return float(np.sqrt(min(v[p > 1].mean() for v, p in zip(variance, h.row_pixels, strict=True))))
+
+
+def _is_lit(result: FitResult, levels: np.ndarray) -> bool:
+    """Signal far above a known black level that does not grow with exposure."""
+    summary = result.summary
+    if summary.black_level_dn is None or len(levels) < 2 or summary.exposure_s.max() < 1.5 * summary.exposure_s.min():
+        return False
+    signal = levels - float(np.mean(summary.black_level_dn))
+    low, high = signal[summary.exposure_s.argmin()], signal[summary.exposure_s.argmax()]
+    return bool(low > LIT_SIGMA * _noise_dn(result) and high < 1.2 * low)

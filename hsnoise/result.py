@@ -78,7 +78,8 @@ class FitResult:
             return [jax.tree.map(np.asarray, _expected(physics, c, light)) for c in range(len(self.summary.histograms))]
 
     def __str__(self) -> str:
-        darks = f"{sum(self.summary.n_frames)} dark frames at {len(self.summary.exposure_s)} exposures"
+        exposures = len(self.summary.exposure_s)
+        darks = f"{sum(self.summary.n_frames)} dark frames at {exposures} exposure{'s' if exposures != 1 else ''}"
         flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
         title = TITLES[self.method]
         table = Table()

@@ -331,3 +331,28 @@ def test_intervals_cover(camera):
     for name in found[0]:
         rms = np.sqrt(np.mean([f[name] ** 2 for f in found]))
         assert 0.6 < rms < 1.5, (name, rms)
+
+
+def test_copies_of_a_frame_are_refused():
+    frame = np.random.default_rng(0).poisson(20, (1, 32, 48)).astype(np.uint16)
+    other = np.random.default_rng(1).poisson(20, (1, 32, 48)).astype(np.uint16)
+    with pytest.raises(ValueError, match="frames 0 and 2 of the 0.1 s exposure are identical"):
+        hsnoise.fit(np.concatenate([frame, other, frame]), exposure_s=0.1, cfa="mono", shutter="global")
+
+
+def test_a_few_pixels_are_refused():
+    frames = np.random.default_rng(0).poisson(20, (4, 2, 2)).astype(np.uint16)
+    with pytest.raises(ValueError, match="at least 8 x 8 pixels"):
+        hsnoise.fit(frames, exposure_s=0.1, cfa="mono", shutter="global")
+
+
+@pytest.mark.parametrize(
+    ("means", "exposure_s", "words"),
+    [((400, 400), (0.1, 0.4), "pass kind='flat'"), ((10, 30), (0.1, 0.1), "All exposures are said to be 0.1 s")],
+)
+def test_what_cannot_be_darks_is_told(means, exposure_s, words):
+    rng = np.random.default_rng(0)
+    counts = [64 + rng.poisson(mean, (4, 32, 48)).astype(np.uint16) for mean in means]
+    stack = hsnoise.FrameStack(counts, exposure_s, black_level=64, cfa="mono", shutter="global")
+    result = hsnoise.fit(stack, method="line")
+    assert any(words in note for note in result.notes)

@@ -20,7 +20,7 @@ from rich.table import Table
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
-from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined
@@ -40,6 +40,7 @@ EVIDENCE = 3.0  # log-likelihood ratio from which an effect is there
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
 MISFIT_LEFT, SHARE_LEFT, MOST_LEFT = 3.5, 0.05, 10.0
+NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a part of the explanation
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
@@ -48,7 +49,10 @@ ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more bright
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What remains beyond the best candidate: the worst group's normal score, and the statistics that carry it."""
+    """What remains: the worst group's normal score, and the statistics that are far off, with their z.
+
+    Beyond what the diagnosis names, or what comes nearest if that explains half of it; else beyond the model.
+    """
 
     misfit: float
     group: str
@@ -142,12 +146,13 @@ def diagnose(
         if judged[0].misfit > MISFIT_LEFT:
             pair = best_pair(judged, evidence)
     ranking = [one.candidate(evidence) for one in judged]
-    found = _verdict(ranking, pair, evidence)
+    laws = {one.of.name: one.of.law(one.amplitude, evidence.null) for one in judged}
+    found = _verdict(ranking, pair, evidence, laws)
     if found.verdict == "unexplained" or CLAMP in [c.name for c in ranking[:2] if c.score > EVIDENCE]:
         clamp = clamp_by_likelihood(fit, bench, evidence)
         if clamp is not None:
             others = [c for c in ranking if c.name != CLAMP]
-            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence)
+            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence, laws)
     return found
 
 
@@ -201,17 +206,17 @@ def _own(candidates: Any, model) -> dict[str, Maker]:
     return makers
 
 
-def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) -> Diagnosis:
-    scores = evidence.null.normal_scores(evidence.z, evidence.groups)
-    worst = max(scores.values())
+def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, laws: dict[str, Gaussian]) -> Diagnosis:
+    """laws: of the statistics with each candidate in the sensor."""
+    worst = evidence.misfit(evidence.null)
     allowed = min(max(MISFIT_LEFT, SHARE_LEFT * worst), MOST_LEFT)
     first, second = ranking[0], ranking[1] if len(ranking) > 1 else None
     names: tuple[str, ...] = (first.name,)
-    left = first.misfit
+    left, law = first.misfit, laws.get(first.name, evidence.null)
     # A second effect is told if the first leaves more than it may, or if the two leave nothing.
     limit = min(left, allowed if left > allowed else MISFIT_LEFT)
     if pair is not None and pair.score > first.score + EVIDENCE and pair.misfit < limit:
-        left, names = pair.misfit, pair.names
+        left, names, law = pair.misfit, pair.names, pair.law
         ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
         first = ranking[0]
     verdict = "named"
@@ -223,24 +228,43 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence) ->
         verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
     elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
         verdict, names = "ambiguous", (first.name, second.name)
+    partly = first.score > EVIDENCE and left < NEAR_ENOUGH * worst
+    if verdict == "nothing missing" or (verdict == "unexplained" and not partly):
+        law = evidence.null
+    blamed = _worst_group(evidence, evidence.null)
+    nearest = names if partly else ()
     if verdict in ("nothing missing", "unexplained"):
-        left, names = worst, ()
-    group = max(scores, key=scores.__getitem__)
-    order = [i for i in np.argsort(-np.abs(evidence.z)) if abs(evidence.z[i]) > 3][:WORST]
+        names = ()
     return Diagnosis(
         ranking=tuple(ranking),
         verdict=verdict,
         best=first if names else None,
         names=names,
-        advice=_advice(verdict, names, first, group),
-        unexplained=Unexplained(left, group, tuple(f"{evidence.names[i]} (z = {evidence.z[i]:+.1f})" for i in order)),
+        advice=_advice(verdict, names or nearest, first, blamed, _worst_group(evidence, law)),
+        unexplained=_what_remains(evidence, law),
     )
 
 
-def _advice(verdict: str, names: tuple[str, ...], first: Candidate, group: str) -> str:
+def _worst_group(evidence: Evidence, law: Gaussian) -> str:
+    scores = law.normal_scores(evidence.z, evidence.groups)
+    return max(scores, key=scores.__getitem__)
+
+
+def _what_remains(evidence: Evidence, law: Gaussian) -> Unexplained:
+    z = law.standardised(evidence.z)
+    order = [i for i in np.argsort(-np.abs(z)) if abs(z[i]) > 3][:WORST]
+    statistics = tuple(f"{evidence.names[i]} (z = {z[i]:+.1f})" for i in order)
+    return Unexplained(evidence.misfit(law), _worst_group(evidence, law), statistics)
+
+
+def _advice(verdict: str, names: tuple[str, ...], first: Candidate, blamed: str, left: str) -> str:
+    """blamed, left: the groups of statistics that are worst before and after what comes nearest."""
     if verdict == "ambiguous":
         return ALIKE[first.name][1] if first.name in ALIKE else f"more frames would tell {names[0]} from {names[1]}"
+    if verdict == "unexplained" and names:
+        told = f"{' and '.join(names)} would explain part of the {blamed} statistics"
+        beside = "what is left of them" if left == blamed else f"the {left} statistics that are left"
+        return f"{told}; no effect in the library explains {beside}"
     if verdict == "unexplained":
-        near = f"; {first.name} comes nearest" if first.score > EVIDENCE else ""
-        return f"none of the effects in the library explains the {group} statistics{near}"
+        return f"none of the effects in the library explains the {blamed} statistics, and none comes near"
     return ""

@@ -27,6 +27,10 @@ class Gaussian:
         out = -0.5 * (square + log_determinant)
         return out if np.ndim(z) > 1 else out[0]
 
+    def standardised(self, z: np.ndarray) -> np.ndarray:
+        """Each of z [statistic] less its mean, over its deviation."""
+        return (z - self.mean) / np.sqrt(np.diagonal(self.covariance))
+
     def normal_scores(self, z: np.ndarray, groups: tuple[str, ...]) -> dict[str, float]:
         """How far z is off in each group of statistics: Wilson and Hilferty's normal score of its chi-square."""
         labels, scores = np.asarray(groups), {}

@@ -90,6 +90,7 @@ class Pair:
     names: tuple[str, str]
     score: float
     misfit: float
+    law: Gaussian
 
 
 def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) -> Judged:
@@ -113,7 +114,7 @@ def best_pair(judged: list[Judged], evidence: Evidence) -> Pair | None:
     if best is None:
         return None
     score, (first, second), law = best
-    return Pair((first.of.name, second.of.name), score, evidence.misfit(law))
+    return Pair((first.of.name, second.of.name), score, evidence.misfit(law), law)
 
 
 def _laws_together(alone: list[Gaussian], second: Judged, null: Gaussian):

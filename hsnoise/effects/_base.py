@@ -262,25 +262,25 @@ def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
 
 
 def coloured_normal(
-    key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype, *, fading_dc: bool = False
+    key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype, *, dc_until: float = 1.0
 ) -> jax.Array:
     """Normal series along axis 1 of `shape`, of variance 1 over the axis on average and power k^-exponent.
 
     A series is a stationary periodic Gaussian process with independent periodogram bins, k = 1 ... n/2 cycles per
-    axis, and has no DC term. With exponent 0 it is independent normals instead, DC included. `fading_dc`: the DC term
-    is 1 - |exponent| of that, so that a fit meets no jump at 0.
+    axis, and has no DC term. With exponent 0 it is independent normals instead, DC included. In between the DC term
+    fades out with |exponent|, until `dc_until`: an estimate, which is never quite 0, meets no jump.
     """
     white = jax.random.normal(key, shape, dtype)
-    spectrum = jnp.fft.rfft(white, axis=1) * _colour_filter(shape[1], exponent, fading_dc)[None, :, None]
+    spectrum = jnp.fft.rfft(white, axis=1) * _colour_filter(shape[1], exponent, dc_until)[None, :, None]
     return jnp.fft.irfft(spectrum, n=shape[1], axis=1)
 
 
-def _colour_filter(n: int, exponent: Scalar, fading_dc: bool) -> jax.Array:
+def _colour_filter(n: int, exponent: Scalar, dc_until: float) -> jax.Array:
     """Amplitudes at k = 0 ... n//2 that turn a white series of n into a coloured one of the same variance."""
     # Amplitudes, not powers: the square root of a zero power at DC would have a NaN gradient.
     k = jnp.minimum(jnp.arange(n), n - jnp.arange(n))
     coloured = jnp.maximum(k, 1).astype(exponent.dtype) ** (-exponent / 2)
-    dc = jnp.maximum(1 - jnp.abs(exponent), 0) if fading_dc else jnp.where(exponent == 0, 1, 0)
+    dc = jnp.maximum(1 - jnp.abs(exponent) / dc_until, 0)
     amplitude = jnp.where(k > 0, coloured, dc)
     mean_power = jnp.mean(amplitude**2)
     # A single row has only the DC term, so a coloured series over it is 0.

@@ -29,5 +29,5 @@ class ColumnNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, _, columns = signal.shape
-        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype, fading_dc=True)
+        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype)
         return signal + self.sigma * jnp.swapaxes(series, 1, 2)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from hsnoise._types import Frames, PerChannel, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
 
+DC_UNTIL = 0.3  # row gain that is nearly white has a mean, that of the paper's 1/f has none
+
 
 class RowGain(AbstractEffect):
     """Gain max(beta, 0) of each row, one series beta[frame, row, channel] of mean 1 per colour and frame.
@@ -17,7 +19,7 @@ class RowGain(AbstractEffect):
     process with independent periodogram bins of mean power proportional to k^-exponent, k = 1 ... rows/2
     cycles per frame, scaled so that its variance over rows is sigma^2 on average over frames; it has no DC
     term. With exponent 0, and with a global shutter whatever the exponent, rows are independent
-    Normal(1, sigma^2) instead, DC included.
+    Normal(1, sigma^2) instead, DC included; the DC term fades out until an exponent of 0.3.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
@@ -31,6 +33,6 @@ class RowGain(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(key, (frames, rows, len(capture.channels)), exponent, signal.dtype)
+        series = coloured_normal(key, (frames, rows, len(capture.channels)), exponent, signal.dtype, dc_until=DC_UNTIL)
         beta = 1 + self.sigma[None, None] * series
         return signal * capture.per_row(jnp.maximum(beta, 0))

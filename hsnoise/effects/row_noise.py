@@ -28,6 +28,4 @@ class RowNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        return signal + self.sigma * coloured_normal(
-            key, (frames, rows, 1), self.exponent, signal.dtype, fading_dc=True
-        )
+        return signal + self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 from hsnoise._types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
 
+DC_UNTIL = 0.3  # as of `row_gain`
+
 
 class SharedRowGain(AbstractEffect):
     """Gain max(1 + sigma x, 0) of each row, one series x[frame, row] for all colours.
 
     The reference voltage of the converters fluctuates while a row is read, whatever its colours. The series runs over
-    all sensor rows with power k^-exponent (no DC term, as in `coloured_normal`); with a global shutter it is white,
+    all sensor rows with power k^-exponent (no DC term, as in `row_gain`); with a global shutter it is white,
     as in the paper.
 
     In dark frames: streaks as of `row_gain`, but correlated between the colours of a row.
@@ -31,5 +33,5 @@ class SharedRowGain(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype)
+        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype, dc_until=DC_UNTIL)
         return signal * jnp.maximum(1 + self.sigma * series, 0)

@@ -62,24 +62,37 @@ def test_two_effects_are_found_together():
     assert best_pair(judged[:1], found) is None
 
 
+NULL = Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS))
+
+
+def pair_of(names: tuple[str, str], score: float, misfit: float) -> Pair:
+    return Pair(names, score, misfit, NULL)
+
+
 def verdict(left: float, pair: Pair | None, worst: float = 20.0):
     """The verdict on a capture whose worst group is `worst` off and of which the first candidate leaves `left`."""
     rows = [("left", 400.0, left), ("middle", 90.0, 15.0), ("right", 20.0, 18.0)]
     ranking = [Candidate(name, fx.RowNoise(1.0), score, 1e-9, misfit) for name, score, misfit in rows]
     z = np.zeros(STATISTICS)
     z[:10] = (1 - 2 / 90 + worst * np.sqrt(2 / 90)) ** 1.5  # Wilson and Hilferty, of ten statistics
-    return decide(ranking, pair, replace(evidence(), z=z))
+    return decide(ranking, pair, replace(evidence(), z=z), laws(z, left, worst))
+
+
+def laws(z: np.ndarray, left: float, worst: float) -> dict[str, Gaussian]:
+    """The law with the first candidate takes so much of z away that `left` remains."""
+    share = 1 - ((1 - 2 / 90 + left * np.sqrt(2 / 90)) / (1 - 2 / 90 + worst * np.sqrt(2 / 90))) ** 1.5
+    return {"left": Gaussian(share * z, np.eye(STATISTICS))}
 
 
 @pytest.mark.parametrize(
     ("left", "pair", "names"),
     [
         (2.0, None, ("left",)),
-        (2.0, Pair(("left", "right"), 420.0, 1.0), ("left", "right")),  # the two leave nothing, and less
-        (3.4, Pair(("left", "right"), 420.0, 3.45), ("left",)),  # no less is left
-        (9.0, Pair(("left", "right"), 420.0, 5.0), ()),  # both leave too much
-        (9.0, Pair(("right", "left"), 401.0, 1.0), ()),  # no more evidence than one
-        (9.0, Pair(("left", "right"), 420.0, 1.0), ("left", "right")),
+        (2.0, pair_of(("left", "right"), 420.0, 1.0), ("left", "right")),  # the two leave nothing, and less
+        (3.4, pair_of(("left", "right"), 420.0, 3.45), ("left",)),  # no less is left
+        (9.0, pair_of(("left", "right"), 420.0, 5.0), ()),  # both leave too much
+        (9.0, pair_of(("right", "left"), 401.0, 1.0), ()),  # no more evidence than one
+        (9.0, pair_of(("left", "right"), 420.0, 1.0), ("left", "right")),
         (9.0, None, ()),
     ],
 )
@@ -93,3 +106,15 @@ def test_names_of_a_verdict(left, pair, names):
 def test_a_strong_effect_may_leave_more_but_not_much():
     assert verdict(5.0, None, worst=200.0).verdict == "named"
     assert verdict(12.0, None, worst=2000.0).verdict == "unexplained"
+
+
+def test_what_remains_is_told_beside_what_is_named():
+    found = verdict(2.0, None)
+    assert found.unexplained.misfit == pytest.approx(2.0, abs=0.3)
+    assert all(abs(float(text.split("z = ")[1].rstrip(")"))) < 6 for text in found.unexplained.statistics)
+
+
+def test_an_effect_that_explains_a_part_is_named_in_the_advice():
+    partly, hardly = verdict(9.0, None), verdict(18.0, None)
+    assert "left would explain part" in partly.advice and partly.unexplained.misfit == pytest.approx(9.0, abs=0.5)
+    assert "none comes near" in hardly.advice and hardly.unexplained.misfit == pytest.approx(20.0, abs=0.5)

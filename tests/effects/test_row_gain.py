@@ -136,3 +136,10 @@ def test_exponent_has_the_gradient_of_finite_differences():
 
 def test_a_single_rolling_row_has_gain_one():
     np.testing.assert_array_equal(beta(0.1, 1.0, rows=1, frames=3), 1.0)
+
+
+@pytest.mark.parametrize(("exponent", "least", "most"), [(0.0, 0.9, 1.1), (0.03, 0.72, 0.93), (0.3, 0.0, 1e-9)])
+def test_the_mean_of_nearly_white_rows_fades_without_a_jump(exponent, least, most):
+    """Estimates of exponent 0 are never quite 0; white rows have a frame mean of variance sigma^2 / rows."""
+    means = beta(0.1, exponent, frames=2000)[:, :, 0].mean(1)
+    assert least <= means.var() / (0.1**2 / ROWS) <= most
