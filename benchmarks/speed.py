@@ -1,4 +1,4 @@
-"""How fast: sampling, its gradient, histograms, fits and diagnosis, side by side with what users would take instead.
+"""How fast: sampling and its gradient, histograms, likelihood, fits, diagnosis, beside what users would take instead.
 
     python -m benchmarks.speed
     python -m benchmarks.speed --only sampling,passes --rounds 3
@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +27,9 @@ from rich.table import Table
 
 import hsnoise
 from hsnoise.effects import ADC
-from hsnoise.statistics import summarise
+from hsnoise.physics import evaluate, physics_of
+from hsnoise.plan import plan_rules
+from hsnoise.statistics import summarise, without_counts
 
 TURN_S = 0.5
 FRAMES, ROWS, COLUMNS = 8, 1024, 1024
@@ -170,6 +173,19 @@ def passes(rounds: int) -> list[Line]:
     return [Line("passes", "row histograms from memory", w, pixels / t, "Mpixel/s") for w, t in times.items()]
 
 
+def likelihood(rounds: int) -> list[Line]:
+    """As many rows and frames as one dark exposure of 12 Mpixel; of narrow ones, as width does not count."""
+    summary = summarise(dark_stack(32, (3000, 256), exposures=1))
+    with jax.enable_x64(True):
+        physics = physics_of(model())
+        rules = jax.tree.map(jnp.asarray, plan_rules(physics, summary))
+        slope = eqx.filter_jit(jax.value_and_grad(evaluate))
+        light = without_counts(summary)
+        times = medians({"hsnoise": lambda: slope(physics, light, rules)}, rounds)
+    what = "32 frames of 3000 rows, value and gradient"
+    return [Line("likelihood", what, who, 1e3 * t, "ms") for who, t in times.items()]
+
+
 def fit(rounds: int) -> list[Line]:
     summary = summarise(dark_stack(8, (160, 240)))
     start = time.perf_counter()
@@ -220,6 +236,7 @@ PARTS = {
     "sampling": sampling,
     "gradient": gradient,
     "passes": passes,
+    "likelihood": likelihood,
     "fit": fit,
     "growth": growth,
     "diagnose": diagnose,

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
@@ -132,15 +129,3 @@ def _like(stack: FrameStack) -> dict[str, Any]:
 def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
     """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`."""
     return (dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS)
-
-
-def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:
-    """`function(argument)` for each, on all cores; results in order. NumPy and JAX let other threads work."""
-
-    def one(argument):
-        result = function(argument)
-        tick()
-        return result
-
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        return list(pool.map(one, arguments))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr
+import scipy  # its parts are imported when they are used
 
 from hsnoise.physics import Physics
 from hsnoise.statistics import RowHistograms, Summary
@@ -15,8 +15,8 @@ def unclip(mean, variance):
     """Mean and variance before clipping at 0 of a normal variable with these moments after it (any shape)."""
     t = np.linspace(-3.0, 9.0, 601)
     density = np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi)
-    clipped_mean = t * ndtr(t) + density
-    clipped_variance = (t * t + 1) * ndtr(t) + t * density - clipped_mean**2
+    clipped_mean = t * scipy.special.ndtr(t) + density
+    clipped_variance = (t * t + 1) * scipy.special.ndtr(t) + t * density - clipped_mean**2
     spread = np.sqrt(np.maximum(variance, 1e-6))
     position = np.interp(mean / spread, clipped_mean / np.sqrt(clipped_variance), t)
     sigma = spread / np.sqrt(np.interp(position, t, clipped_variance))

@@ -14,6 +14,7 @@ import equinox as eqx
 import numpy as np
 
 from hsnoise._frames import channel_planes
+from hsnoise._threads import in_threads
 from hsnoise._types import channels_of
 from hsnoise.stack import FrameStack
 
@@ -23,6 +24,8 @@ MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (g
 FLICKER = 0.5  # of the mean: more is another light
 OUTLIER_SCALE = 2.0
 SAMPLE_PIXELS = 200_000
+BLOCK_PIXELS = 32_768  # of a Bayer plane that a thread counts at a time: copies of them stay in its cache
+MOST_TABLE = 65_535  # codes up to this find their bin in a table
 
 
 class RowHistograms(eqx.Module):
@@ -106,6 +109,15 @@ def row_stride(cfa: str, channel: str) -> int:
     return 1 if cfa == "mono" or len(channel_planes(cfa, channel)) == 2 else 2
 
 
+def row_pixels(shape: tuple[int, int], cfa: str) -> int:
+    """Pixels in a row of one colour of frames (rows, columns)."""
+    return shape[1] if cfa == "mono" else shape[1] // 2
+
+
+def _count_type(pixels: int):
+    return np.uint16 if pixels < 65536 else np.uint32
+
+
 def some_frames(summary: Summary, start: int, stop: int) -> Summary:
     """The summary of frames start to stop of each dark exposure (and of all flats); empty frames fill it up."""
 
@@ -179,8 +191,7 @@ def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) 
     # One number of bins for all channels and exposures: they share compiled programs.
     bins = round_up(2 + max(n for of in coding for _, _, n in of.values()))
     rows = {c: stack.shape[0] // row_stride(stack.cfa, c) for c in channels}
-    pixels = stack.shape[1] if stack.cfa == "mono" else stack.shape[1] // 2
-    dtype = np.uint16 if pixels < 65536 else np.uint32
+    dtype = _count_type(row_pixels(stack.shape, stack.cfa))
     counts = {c: np.zeros((len(groups), frames, rows[c], bins), dtype) for c in channels}
     moments = {c: np.zeros((2, len(groups), frames, rows[c])) for c in channels}
     for e, i in enumerate(groups):
@@ -208,11 +219,21 @@ def _reduced(
     frame: np.ndarray, cfa: str, coding: dict[str, tuple[int, int, int]], bins: int, white_level: float | None
 ):
     """Of each channel of a frame: histograms [row, bin], and sums of counts and of their squares [2, row]."""
-    out = {}
-    for c, (low, width, _) in coding.items():
-        y = channel_rows(frame, cfa, c)
-        sums = np.stack([y.sum(1, dtype=np.float64), np.einsum("rp,rp->r", y, y, dtype=np.float64)])
-        out[c] = _count_rows(y, low, width, bins, white_level).astype(np.uint32), sums
+    highest, pixels = int(frame.max()), row_pixels(frame.shape, cfa)
+    bin_of = {c: _bin_of(low, width, bins, white_level, highest) for c, (low, width, _) in coding.items()}
+    rows = {c: len(frame) // row_stride(cfa, c) for c in coding}
+    out = {c: (np.empty((n, bins), _count_type(pixels)), np.empty((2, n))) for c, n in rows.items()}
+
+    def reduce(start: int) -> None:
+        for c, (counts, sums) in out.items():
+            codes = channel_rows(frame[start : start + step], cfa, c).astype(np.intp)
+            at = slice(start // row_stride(cfa, c), start // row_stride(cfa, c) + len(codes))
+            as_floats = codes.astype(np.float64)
+            counts[at] = _count_rows(bin_of[c](codes), bins)
+            sums[:, at] = codes.sum(1), np.vecdot(as_floats, as_floats)
+
+    step = 2 * max(1, BLOCK_PIXELS // pixels)
+    in_threads(reduce, range(0, len(frame), step))
     return out
 
 
@@ -236,11 +257,16 @@ def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
 
 def _codings(stack: FrameStack, group: int) -> dict[str, tuple[int, int, int]]:
     """`_coding` of each channel of an exposure, from its first and last frame."""
-    ends = [stack.frame(group, f) for f in sorted({0, stack.n_frames[group] - 1})]
-    return {
-        c: _coding(np.stack([channel_rows(frame, stack.cfa, c) for frame in ends]), stack.white_level)
-        for c in stack.channels
-    }
+    numbers = sorted({0, stack.n_frames[group] - 1})
+    samples = [_samples(stack.frame(group, n), stack.cfa, stack.channels, len(numbers)) for n in numbers]
+    codings = in_threads(lambda of: _coding(np.stack(of), stack.white_level), zip(*samples, strict=True))
+    return dict(zip(stack.channels, codings, strict=True))
+
+
+def _samples(frame: np.ndarray, cfa: str, channels: tuple[str, ...], frames: int) -> list[np.ndarray]:
+    """Every n-th row of each channel, about SAMPLE_PIXELS in `frames` frames; copies, so that the frame may go."""
+    rows = (channel_rows(frame, cfa, c) for c in channels)
+    return [y[:: max(1, frames * y.size // SAMPLE_PIXELS)].copy() for y in rows]
 
 
 def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, int]:
@@ -248,8 +274,7 @@ def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, in
 
     The range is robust (quantiles), so that hot pixels do not stretch it: what lies outside is one open bin.
     """
-    sample = sample[:, :: max(1, sample.size // SAMPLE_PIXELS)]
-    q05, q50, q95 = np.quantile(sample, [0.05, 0.5, 0.95])
+    q05, q50, q95 = _quantiles(sample, np.array([0.05, 0.5, 0.95]))
     sigma = max(float(np.sqrt(np.median(sample.var(-1)))), 0.5)
     reach = RANGE_SIGMAS / 1.645
     low = int(max(q50 - reach * max(q50 - q05, sigma), 1))  # code 0 is always in the first, open bin
@@ -261,24 +286,44 @@ def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, in
     return low, width, max(1, -(-(high - low) // width))
 
 
+def _quantiles(sample: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """As `np.quantile`, several times as fast for 16-bit counts, which a stable sort sorts by radix."""
+    ordered = np.sort(sample, axis=None, kind="stable" if sample.dtype.itemsize <= 2 else None)
+    place = at * (ordered.size - 1)
+    below = place.astype(np.intp)  # the last place is never asked for
+    ends = ordered[np.stack([below, below + 1])].astype(np.float64)
+    return ends[0] + (ends[1] - ends[0]) * (place - below)
+
+
 def _edges(low: int, width: int, bins: int, white_level: float | None) -> np.ndarray:
     edges = low - 0.5 + width * np.arange(bins - 1, dtype=np.float64)
     # Counts at the white level are clipped: they may hold everything above, so no edge lies beyond.
     return edges if white_level is None else np.minimum(edges, white_level - 0.5)
 
 
-def _count_rows(y: np.ndarray, low: int, width: int, bins: int, white_level: float | None) -> np.ndarray:
-    """Histogram of each row of `y` over the bins of `_edges`."""
-    code = y.astype(np.int32)
-    code -= low
-    if width > 1:
-        np.floor_divide(code, width, out=code)
-    code += 1
-    np.clip(code, 0, bins - 1, out=code)
-    if white_level is not None:
-        code[y >= white_level] = bins - 1
-    code += (bins * np.arange(len(y), dtype=np.int32))[:, None]
-    return np.bincount(code.ravel(), minlength=bins * len(y)).reshape(len(y), bins)
+def _bin_of(low: int, width: int, bins: int, white_level: float | None, highest: int):
+    """The function from codes up to `highest` to their bins of `_edges`."""
+
+    def compute(codes: np.ndarray) -> np.ndarray:
+        at = codes - low
+        if width > 1:
+            at //= width
+        at += 1
+        np.clip(at, 0, bins - 1, out=at)
+        if white_level is not None:
+            at[codes >= white_level] = bins - 1
+        return at
+
+    if highest > MOST_TABLE:
+        return compute
+    table = compute(np.arange(highest + 1))
+    return lambda codes: table.take(codes, mode="clip")  # no code is out of range: clipping saves a check
+
+
+def _count_rows(at: np.ndarray, bins: int) -> np.ndarray:
+    """Histogram of each row of bins `at`, which it changes."""
+    at += (bins * np.arange(len(at)))[:, None]
+    return np.bincount(at.ravel(), minlength=bins * len(at)).reshape(len(at), bins)
 
 
 def _flat_moments(stack: FrameStack, groups: list[int], tick) -> FlatMoments:

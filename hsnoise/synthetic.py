@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._threads import in_threads
 from hsnoise.coordinates import Coordinates, coordinates_for
-from hsnoise.draws import black_level_of, draw_capture, floored_variance, in_threads, part_of
+from hsnoise.draws import black_level_of, draw_capture, floored_variance, part_of
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics

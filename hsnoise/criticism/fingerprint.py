@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hsnoise._threads import in_threads
 from hsnoise.criticism.candidates import Maker, made
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.reference import Reference, measure
-from hsnoise.draws import draw_capture, in_threads
+from hsnoise.draws import draw_capture
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 

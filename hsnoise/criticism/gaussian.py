@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
+import scipy  # its parts are imported when they are used
 
 
 @dataclass(frozen=True)
@@ -16,13 +16,13 @@ class Gaussian:
     covariance: np.ndarray
 
     def factor(self) -> tuple[np.ndarray, bool]:
-        return cholesky(self.covariance, lower=True), True
+        return scipy.linalg.cholesky(self.covariance, lower=True), True
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log density, up to the constant that all share, of z [..., statistic]."""
         factor = self.factor()
         residual = np.atleast_2d(z) - self.mean
-        square = (residual * cho_solve(factor, residual.T).T).sum(-1)
+        square = (residual * scipy.linalg.cho_solve(factor, residual.T).T).sum(-1)
         log_determinant = 2 * np.log(np.diagonal(factor[0])).sum()
         out = -0.5 * (square + log_determinant)
         return out if np.ndim(z) > 1 else out[0]

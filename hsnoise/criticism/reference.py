@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hsnoise.draws import black_level_of, draw_capture, floored_variance, in_threads
+from hsnoise._threads import in_threads
+from hsnoise.draws import black_level_of, draw_capture, floored_variance
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 from hsnoise.structure import Structure, structure

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hsnoise._threads import in_threads
 from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench
 from hsnoise.criticism.ranking import Evidence
-from hsnoise.draws import in_threads
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.synthetic import Knob, knobs

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise._frames import channel_pixels, channel_planes
-from hsnoise.draws import check_fits, darks_of, draw_capture, in_threads
+from hsnoise._threads import in_threads
+from hsnoise.draws import check_fits, darks_of, draw_capture
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy  # its parts are imported when they are used
 
 from hsnoise.structure._anova import Exposure
 from hsnoise.structure._sheet import Sheet, correlation, fisher, log_ratio
@@ -177,4 +177,6 @@ def _whitened(series: np.ndarray) -> np.ndarray:
 def peak(periodogram: np.ndarray) -> float:
     """Log of the largest value over its surroundings (a running median), which a 1/f rise does not move."""
     width = min(31, len(periodogram) // 4 * 2 + 1)
-    return float(log_ratio(np.max(periodogram / (median_filter(periodogram, width, mode="reflect") + 1e-12)), 1.0))
+    return float(
+        log_ratio(np.max(periodogram / (scipy.ndimage.median_filter(periodogram, width, mode="reflect") + 1e-12)), 1.0)
+    )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import rfft2
+import scipy  # its parts are imported when they are used
 
 from hsnoise.structure._anova import BOUND, Exposure
 from hsnoise.structure._pixels import log_temporal_variance
@@ -93,7 +93,7 @@ def _pairs(
 def map_peak(views: list[View]) -> float:
     """Log of the largest value of the two-dimensional periodogram of the mean static map, over its median."""
     total = np.clip(sum(view.pixel for view in views), -BOUND * len(views), BOUND * len(views))
-    power = np.square(np.abs(rfft2(total[:, :MOST_MAP_SIDE, :MOST_MAP_SIDE]))).sum(0)[1:, 1:]
+    power = np.square(np.abs(scipy.fft.rfft2(total[:, :MOST_MAP_SIDE, :MOST_MAP_SIDE]))).sum(0)[1:, 1:]
     return float(log_ratio(power.max() / max(float(np.median(power)), 1e-12), 1.0))
 
 
