@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-import hsnoise
+from hsnoise.io import load
 from hsnoise.model import NoiseModel
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import linear_from_display
@@ -51,7 +51,7 @@ def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
 
 def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndarray]:
     """Light of raw frames, of a white that makes the first frame of ordinary brightness."""
-    stack = hsnoise.load(args.video, cfa=camera.cfa, kind="flat", exposure_s=camera.exposure_s)
+    stack = load(args.video, cfa=camera.cfa, kind="flat", exposure_s=camera.exposure_s)
     white_e = None
     for group, count in enumerate(stack.n_frames):
         for number in range(count):

@@ -34,7 +34,7 @@ SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
-LONGEST_STEP = 1.5
+LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
 SHRINKAGE = 0.1
 MARGIN = 1.15
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
@@ -188,6 +188,12 @@ class Problem:
             score = self.whiten.T @ np.asarray(gradient)
         return np.concatenate([score, found.values]), np.concatenate([np.full(len(score), 0.3), found.error])
 
+    def share_of(self, step: np.ndarray) -> float:
+        """How much of a step may be made at once: statistics are straight lines of the parameters only nearby."""
+        n = len(self.centre)
+        base = np.abs(self.whiten @ step[:n]) / self.sizes
+        return min(1.0, LONGEST_STEP / max(np.abs(step[n:]).max(initial=0.0), base.max() / LONGEST_OF_BASE, 1e-12))
+
     def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics(draw_capture(self.seed + number, self.at(y), self.part))
 
@@ -209,7 +215,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
         whole = whole.add(model[name])
     problem = Problem(part, base, whole, extra, knobs(whole, extra), seed)
     measured, _ = problem.statistics(part)
-    y, n = problem.start, len(problem.centre)
+    y = problem.start
     scale, weight = _weights(problem, y, tick)
     prior, slopes = problem.prior, None
     last_step, sure = np.inf, False
@@ -221,8 +227,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
             covariance, gain = np.linalg.inv(information), slopes.T @ weight
             sure = last_step < SURE_STEP or iteration == MOST_SLOPES
         step = covariance @ (gain @ ((measured - drawn.mean(0)) / scale) - prior * (y - problem.start))
-        longest = np.abs(step[n:]).max(initial=0.0)
-        y = y + step * min(1.0, LONGEST_STEP / max(longest, 1e-12))
+        y = y + step * problem.share_of(step)
         last_step = float(np.abs(step / np.sqrt(np.diagonal(covariance))).max())
         if sure and last_step < SHORT_STEP:
             break
