@@ -12,6 +12,7 @@ import numpy as np
 import hsnoise
 from hsnoise import NoiseModel, photoelectrons_from_illuminance
 from hsnoise._keys import named_key
+from hsnoise._types import cfa_tile
 from hsnoise.draws import black_level_of
 from hsnoise.effects import BlackLevel, DarkCurrent, ReadNoise, ShotNoise
 from hsnoise.mosaic import electrons_of, mosaic
@@ -104,29 +105,32 @@ def noise_of(kind: str, camera: Camera) -> NoiseModel:
 
 
 def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: float | None = None) -> NoiseModel:
-    """Independent noise of the same variance in each pixel: that of the model's darks, or `dark_variance_e2`.
+    """Independent noise of the same variance in each pixel: that of the model's frames, or of `dark_variance_e2`.
 
     "poisson-gaussian": shot noise, and read noise that makes up the variance of darks (so that variance against mean
     is the same line). "gaussian": one variance for all, that at `light_e` photoelectrons.
     """
-    variance_e2 = _dark_variance_e2(model) if dark_variance_e2 is None else dark_variance_e2
+    light_e = light_e if kind == "gaussian" else 0.0
+    variance_e2 = _variance_e2(model, light_e) if dark_variance_e2 is None else dark_variance_e2 + light_e
     rate = model["dark_current"].rate if "dark_current" in model else jnp.zeros(())
     dark_e = float(rate) * model.exposure_s
     if kind == "poisson-gaussian":
         effects = [ShotNoise(), DarkCurrent(rate), ReadNoise(float(np.sqrt(max(variance_e2 - dark_e, 1e-6))))]
         black_level = black_level_of(model)
     else:
-        effects = [ReadNoise(float(np.sqrt(variance_e2 + light_e)))]
+        effects = [ReadNoise(float(np.sqrt(variance_e2)))]
         black_level = black_level_of(model) + np.asarray(model["gain"].value) * dark_e
     effects += [model["gain"], BlackLevel(jnp.asarray(black_level)), *([model["adc"]] if "adc" in model else [])]
     return NoiseModel(effects, cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
 
 
-def _dark_variance_e2(model: NoiseModel) -> float:
-    """Temporal variance of darks, mean over channels, e-^2, from differences of frames of one sensor."""
-    counts = np.asarray(hsnoise.sample_dark(jax.random.key(0), MATCH_FRAMES, MATCH_SHAPE, model), np.float64)
-    electrons = np.asarray(electrons_of(counts, model), np.float64)
-    return float(0.5 * np.mean(np.diff(electrons, axis=0) ** 2))
+def _variance_e2(model: NoiseModel, light_e: float) -> float:
+    """Temporal variance of sensor pixels in even light, mean over them, e-^2, from differences of frames."""
+    light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
+    counts = np.asarray(hsnoise.sample(jax.random.key(0), light, model), np.float64)
+    gain, tile = np.ravel(model["gain"].value), cfa_tile(model.cfa)
+    gain = np.tile(gain[tile % gain.size], [n // len(tile) for n in MATCH_SHAPE])
+    return float(0.5 * np.mean((np.diff(counts, axis=0) / gain) ** 2))
 
 
 def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseModel:

@@ -66,13 +66,15 @@ def features_of(state: dict[str, np.ndarray]) -> Callable[[jax.Array], jax.Array
     ]
 
     def features(frames: jax.Array) -> jax.Array:
-        x = jnp.broadcast_to(frames, (*frames.shape[:-1], 3)).reshape(-1, *frames.shape[-3:-1], 3)
-        x = (x - jnp.array(MEAN)) / jnp.array(DEVIATION)
+        x = jnp.broadcast_to(jnp.asarray(frames, jnp.float32), (*frames.shape[:-1], 3)).reshape(
+            -1, *frames.shape[-3:-1], 3
+        )
+        x = (x - np.float32(MEAN)[None, None, None]) / np.float32(DEVIATION)[None, None, None]
         for i, (weight, bias) in enumerate(layers):
             if i == POOL_AFTER:
                 x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
             x = jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
-            x = jax.nn.relu(x + bias)
+            x = jax.nn.relu(x + bias[None, None, None])
         return x
 
     return features

@@ -7,13 +7,17 @@ import json
 import jax
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import hsnoise
-from benchmarks import _checkpoints, train
+from benchmarks import _checkpoints, evaluate, train
 from benchmarks._clips import Clip, crops, held_out, moving_stills, read_clips
 from benchmarks._noisy import OPTICS, camera_of, jittered, matched, noise_of
+from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._training import Recipe, Trainer, batch_rng, examples
-from hsnoise.mosaic import electrons_of
+from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
+from hsnoise._types import cfa_tile
+from hsnoise.photometry import display_from_linear
 from hsnoise.weights import load_network
 
 TINY = train.Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
@@ -161,20 +165,17 @@ def test_jitter_changes_what_may_not_be_negative_by_a_tenth():
 def test_simpler_noise_has_the_same_variance(kind):
     camera, light_e = hsnoise.cameras.grasshopper3(black_level_dn=200), 4.0
     simple = matched(camera, kind, light_e)
-    dark = [
-        np.asarray(electrons_of(hsnoise.sample_dark(jax.random.key(1), 8, (128, 128), m), camera))
-        for m in (camera, simple)
-    ]
-    lit = [
-        np.asarray(
-            electrons_of(hsnoise.sample(jax.random.key(2), np.full((8, 128, 128), light_e, np.float32), m), camera)
-        )
-        for m in (camera, simple)
-    ]
-    assert lit[1].mean() == pytest.approx(lit[0].mean(), abs=0.1)
-    assert dark[1].mean() == pytest.approx(dark[0].mean(), abs=0.1)
-    same = dark if kind == "poisson-gaussian" else lit
-    assert same[1].var() == pytest.approx(same[0].var(), rel=0.1)
+    gain = np.tile(np.asarray(camera["gain"].value)[cfa_tile("RGGB")], (64, 64))
+
+    def electrons(model, light):
+        frames = np.full((16, 128, 128), light, np.float32)
+        return (np.asarray(hsnoise.sample(jax.random.key(1), frames, model), float) - 200) / gain
+
+    for light in (0.0, light_e):
+        own, other = electrons(camera, light), electrons(simple, light)
+        assert other.mean() == pytest.approx(own.mean(), abs=0.1)
+        if (light == 0) == (kind == "poisson-gaussian"):
+            assert other.var() == pytest.approx(own.var(), rel=0.05)
 
 
 def test_light_of_the_paper():
@@ -191,3 +192,80 @@ def test_noise_of_another_sensor_is_refused(tmp_path):
         noise_of(str(path), camera_of("canon_5d3", None, None))
     with pytest.raises(ValueError, match="--white-e: needed"):
         camera_of(str(path), None, None)
+
+
+def vgg_state(seed=0, **changed):
+    rng = np.random.default_rng(seed)
+    state = {}
+    for place, inputs, outputs in LAYERS:
+        state[f"features.{place}.weight"] = rng.normal(0, 0.05, (outputs, inputs, 3, 3)).astype(np.float32)
+        state[f"features.{place}.bias"] = rng.normal(0, 0.05, outputs).astype(np.float32)
+    return {**state, **changed}
+
+
+def test_perceptual_features_are_those_of_the_file(tmp_path):
+    safetensors = pytest.importorskip("safetensors.numpy")
+    path = tmp_path / "vgg.safetensors"
+    safetensors.save_file(vgg_state(), path)
+    state, digest = read_weights(path)
+    frames = np.random.default_rng(1).uniform(0, 1, (2, 8, 8, 3)).astype(np.float32)
+    found = np.asarray(features_of(state)(frames))
+    assert found.shape == (2, 4, 4, 128) and "unknown origin" in name_of(digest)
+    # The first place by hand: two convolutions of 3 x 3, the pool, two more; mono frames stand for grey ones.
+    grey = np.repeat(frames[..., :1], 3, -1)
+    np.testing.assert_allclose(features_of(state)(frames[..., :1]), features_of(state)(grey), atol=1e-6)
+    np.testing.assert_allclose(found, by_scipy(state, frames), rtol=1e-3, atol=1e-4)
+
+
+def by_scipy(state, frames):
+    """The same in SciPy's correlation."""
+    x = (frames - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
+    for i, (place, inputs, outputs) in enumerate(LAYERS):
+        weight, bias = state[f"features.{place}.weight"], state[f"features.{place}.bias"]
+        if i == 2:
+            x = x.reshape(len(x), x.shape[1] // 2, 2, x.shape[2] // 2, 2, -1).max((2, 4))
+        y = np.zeros((*x.shape[:3], outputs))
+        for n in range(len(x)):
+            for o in range(outputs):
+                for c in range(inputs):
+                    y[n, :, :, o] += ndimage.correlate(x[n, :, :, c], weight[o, c], mode="constant")
+        x = np.maximum(y + bias, 0)
+    return x
+
+
+def test_other_weights_are_refused(tmp_path):
+    safetensors = pytest.importorskip("safetensors.numpy")
+    path = tmp_path / "vgg.safetensors"
+    safetensors.save_file(vgg_state(**{"features.2.bias": np.zeros(3, np.float32)}), path)
+    with pytest.raises(ValueError, match=r"features.2.bias of shape \(64,\), got \(3,\)"):
+        read_weights(path)
+    path.write_bytes(b"cut off")
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_weights(path)
+
+
+def test_rivals_make_noisy_frames_better():
+    rng = np.random.default_rng(0)
+    clean = np.asarray(display_from_linear(np.full((3, 32, 32, 3), 0.3)))
+    noisy = (0.3 + 0.1 * rng.standard_normal((3, 32, 32, 3))).astype(np.float32)
+    before = np.mean((np.asarray(display_from_linear(noisy)) - clean) ** 2)
+    for name, denoise in rivals().items():
+        if name.startswith("BM"):
+            continue
+        choice = tuned(denoise, noisy, clean, 0.1)
+        after = np.mean((denoised(denoise, noisy, 0.1, *choice) - clean) ** 2)
+        assert after < 0.2 * before, name
+
+
+def test_an_evaluation_is_written(folder, tmp_path, capsys):
+    train.main(arguments(folder, tmp_path / "run"))
+    weights = tmp_path / "run" / train.ENDED
+    evaluate.main(
+        [str(weights), "--clips", str(folder), "--crop", "8", "--no-rivals", "--out", str(tmp_path / "found")]
+    )
+    text = (tmp_path / "found" / "evaluation.md").read_text()
+    assert "scaled input" in text and "hsnoise ST-LSTM" in text and "| d |" in text
+    assert (tmp_path / "found" / "curves.png").exists() and (tmp_path / "found" / "frames-d.png").exists()
+    with pytest.raises(SystemExit):
+        evaluate.main([str(weights.with_name("run.json")), "--clips", str(folder)])
+    assert "not a file of weights" in capsys.readouterr().err
