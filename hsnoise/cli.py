@@ -25,6 +25,7 @@ from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomic
 from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
+from hsnoise.draws import check_fits
 from hsnoise.effects import RowNoise
 from hsnoise.fit import FitResult
 from hsnoise.model import NoiseModel
@@ -139,6 +140,7 @@ def _fit(args: argparse.Namespace) -> None:
 def _compare(args: argparse.Namespace) -> None:
     _check_outputs(args)
     model, stack = _model(args.model), _load(args.paths, args)
+    check_fits(model, stack)
     args.out.mkdir(parents=True, exist_ok=True)
     with _busy("Drawing from the model") as say:
         found = hsnoise.compare(model, stack, seed=args.seed, progress=_counter(say, "Captures drawn from the model"))

@@ -52,7 +52,8 @@ def check_fits(model: NoiseModel, stack: FrameStack) -> None:
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
     if (model.cfa, model.shutter) != (stack.cfa, stack.shutter):
         raise ValueError(
-            f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter}"
+            f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
+            " files do not say so, give it cfa= and shutter=)"
         )
 
 

@@ -23,6 +23,7 @@ from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
+CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 MOST_STEPS = 6
 MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
@@ -206,6 +207,8 @@ def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
 
 def _end(found: Diagnosis, comparison: Comparison) -> str:
     if found.verdict == "nothing missing":
+        if comparison.error > CHANCE_ERROR:
+            return f"No effect stands out, but something weak may be left: the error is {comparison.error:.2f}."
         return f"Nothing significant is left (error {comparison.error:.2f})."
     advice = f": {found.advice}" if found.advice else ""
     return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
