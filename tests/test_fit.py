@@ -85,7 +85,13 @@ def test_expected_histograms_match_the_measured_ones(canon_fit):
 
 
 @pytest.mark.parametrize(
-    ("camera", "black"), [("canon_5d3", 2000.0), ("grasshopper3", 64.0), ("grasshopper3", 0.0)], ids=str
+    ("camera", "black"),
+    [
+        ("canon_5d3", 2000.0),
+        pytest.param("grasshopper3", 64.0, marks=pytest.mark.slow),
+        pytest.param("grasshopper3", 0.0, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 @pytest.mark.parametrize("black_level", [pytest.param("known", marks=pytest.mark.slow), "unknown"])
 def test_cameras_and_black_levels(camera, black, black_level):
@@ -234,6 +240,7 @@ def assert_pilot_ends_where(whole, monkeypatch):
         assert 0.7 < piloted.table[name][1] / error < 1.4
 
 
+@pytest.mark.slow
 def test_pilot_of_a_large_capture_ends_where_the_whole_does(monkeypatch, canon_fit):
     assert_pilot_ends_where(canon_fit[1], monkeypatch)
 
@@ -280,6 +287,7 @@ def test_flats_of_several_lights_in_one_group_are_refused(rng):
         hsnoise.fit(flats, exposure_s=0.1, kind="flat", black_level=50, shutter="global")
 
 
+@pytest.mark.slow
 def test_directions_known_a_thousand_times_better_than_others_leave_errors_honest(rng):
     """Read noise far above shot noise: the product of gain and dark current is known well, each alone hardly."""
     frames = [

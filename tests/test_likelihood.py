@@ -152,6 +152,7 @@ def test_jit_vmap_and_a_float32_session_give_the_same():
     assert all(np.isfinite(np.asarray(g)).all() for g in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_rules_hold_away_from_where_they_were_made():
     """A rule made at the truth is still exact where a fit may wander; finer rules change nothing."""
     model = camera(shutter="rolling", black_level_dn=10.0)

@@ -54,6 +54,7 @@ def hidden():
     return stack, hsnoise.fit(stack)
 
 
+@pytest.mark.slow
 def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
     stack, base = hidden
     model = base.params.add(RowNoise(1.4))
