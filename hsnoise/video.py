@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -56,10 +58,10 @@ def frames_of(path: str | os.PathLike) -> Iterator[np.ndarray]:
 
 
 def frame_rate_of(path: str | os.PathLike, default: float = 25) -> Fraction:
-    """Frames a second of a video file; `default` of what says none."""
+    """Frames a second of a video file; `default` of what says none. Raises ValueError for what cannot be read."""
     path = Path(path)
     if path.suffix.lower() in VIDEO:
-        with _av(path).open(str(path)) as container:
+        with _opened(path) as container:
             rate = container.streams.video[0].average_rate if container.streams.video else None
             if rate:
                 return Fraction(rate)
@@ -106,16 +108,24 @@ def _av(path: Path) -> ModuleType:
     return av
 
 
-def _decoded(path: Path) -> Iterator[np.ndarray]:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     av = _av(path)
     try:
         with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise ValueError(f"{path}: holds no video")
-            for frame in container.decode(video=0):
-                yield frame.to_ndarray(format="rgb24")
+            yield container
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file or folder") from error
     except av.FFmpegError as error:
         raise ValueError(f"{path}: cannot be read as video ({error})") from error
+
+
+def _decoded(path: Path) -> Iterator[np.ndarray]:
+    with _opened(path) as container:
+        if not container.streams.video:
+            raise ValueError(f"{path}: holds no video")
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="rgb24")
 
 
 def _images(folder: Path) -> Iterator[np.ndarray]:
