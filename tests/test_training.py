@@ -10,13 +10,14 @@ import pytest
 from scipy import ndimage
 
 import hsnoise
-from benchmarks import _checkpoints, evaluate, train
+from benchmarks import _checkpoints, evaluate, noise_ablation, train
 from benchmarks._clips import Clip, crops, held_out, moving_stills, read_clips
-from benchmarks._noisy import OPTICS, camera_of, jittered, matched, noise_of
+from benchmarks._noisy import OPTICS, Camera, camera_of, jittered, matched, noise_of
 from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._training import Recipe, Trainer, batch_rng, examples
 from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
 from hsnoise._types import cfa_tile
+from hsnoise.effects import ADC, BlackLevel, Gain, ReadNoise, ShotNoise
 from hsnoise.photometry import display_from_linear
 from hsnoise.weights import load_network
 
@@ -185,8 +186,6 @@ def test_light_of_the_paper():
 
 def test_noise_of_another_sensor_is_refused(tmp_path):
     path = tmp_path / "mono.json"
-    from hsnoise.effects import Gain, ReadNoise
-
     hsnoise.NoiseModel([ReadNoise(2.0), Gain(1.0)], cfa="mono", shutter="global", exposure_s=0.1).save(path)
     with pytest.raises(ValueError, match="cfa mono"):
         noise_of(str(path), camera_of("canon_5d3", None, None))
@@ -269,3 +268,34 @@ def test_an_evaluation_is_written(folder, tmp_path, capsys):
     with pytest.raises(SystemExit):
         evaluate.main([str(weights.with_name("run.json")), "--clips", str(folder)])
     assert "not a file of weights" in capsys.readouterr().err
+
+
+def mono_camera(white_e=(20.0, 20.0)):
+    model = hsnoise.NoiseModel(
+        [ShotNoise(), ReadNoise(2.0), Gain(0.5), BlackLevel(10.0), ADC(4095)],
+        cfa="mono",
+        shutter="global",
+        exposure_s=0.1,
+    )
+    return Camera("sensor", model, white_e)
+
+
+def test_light_is_added_to_real_dark_frames():
+    camera = mono_camera()
+    unseen = np.asarray(hsnoise.sample_dark(jax.random.key(0), 6, (40, 50), camera.model))
+    sensor = noise_ablation.Sensor("sensor", None, unseen, 0.1)
+    clip = Clip("even", np.full((9, 36, 36, 3), 188, np.uint8))
+    clean, noisy = noise_ablation.real_scene(sensor, clip, camera, 3)
+    assert clean.shape == noisy.shape == (6, 36, 36, 1)  # as many frames as there are dark ones
+    assert noisy.mean() == pytest.approx(0.503, abs=0.02)
+    electrons = 20 * 0.503
+    assert noisy.std() * 20 == pytest.approx(np.sqrt(electrons + 4 + (1 / 12 / 0.25) * 2), rel=0.05)
+
+
+def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
+    base = np.array([[20.0, 22.0, 24.0, 26.0]] * 2)
+    apart = np.array([[0.9, 1.1, 0.9, 1.1], [1.1, 1.3, 1.1, 1.3]])
+    of = {"gaussian": base - 1, "poisson-gaussian": base, "paper": base + apart, "improved": base + 2 * apart}
+    _, text = noise_ablation.table_of({"imx541": {name: values.tolist() for name, values in of.items()}})
+    over_clips = apart.mean(0).std(ddof=1) / 2
+    assert f"| +1.10 +- {np.hypot(over_clips, 0.1):.2f} dB |" in text and "| 23.00 | 24.10 |" in text
