@@ -133,7 +133,7 @@ def dark_sigma_e(sensor: Sensor, params: NoiseModel) -> float:
 
 def trained(sensor: Sensor, name: str, models: dict[str, NoiseModel], clips, seed: int, options) -> Path:
     """Weights of a network that was trained with one of the noises."""
-    path = options.out / f"{sensor.name}-{name}-{seed}.eqx"
+    path = options.out / f"{sensor.name}-{name}-{options.maps}-{options.steps}-{seed}.eqx"
     if path.exists():
         return path
     camera = camera_of(sensor, models["paper"])
