@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -43,7 +43,9 @@ class Trainer:
     def __init__(
         self, recipe: Recipe, steps: int, camera: Camera, noise: NoiseModel, perceptual: Callable | None = None
     ):
-        self.recipe, self.camera, self.noise = recipe, camera, noise
+        # Fits are in double precision, training is not.
+        single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
+        self.recipe, self.camera, self.noise = recipe, replace(camera, model=single(camera.model)), single(noise)
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
