@@ -4,41 +4,17 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.table import Table
 from scipy.stats import beta
 
 from benchmarks._grid_cells import CLEAN, hidden_in
+from benchmarks._sheet import Sheet
 from benchmarks.simulator import ODD
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 WITHIN = 4.0  # standard errors
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A table for the terminal and for Markdown; the first `left` columns are text."""
-
-    title: str
-    headings: tuple[str, ...]
-    rows: list[tuple[str, ...]] = field(default_factory=list)
-    left: int = 1
-
-    def rich(self) -> Table:
-        table = Table(title=self.title, title_justify="left")
-        for i, heading in enumerate(self.headings):
-            table.add_column(heading, justify="left" if i < self.left else "right")
-        for row in self.rows:
-            table.add_row(*row)
-        return table
-
-    def markdown(self) -> str:
-        rule = ["---" if i < self.left else "---:" for i in range(len(self.headings))]
-        lines = ["| " + " | ".join(cells) + " |" for cells in (self.headings, rule, *self.rows)]
-        return "\n".join([f"## {self.title}", "", *lines, ""])
 
 
 def sheets(records: Iterable[dict]) -> list[Sheet]:

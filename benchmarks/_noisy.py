@@ -16,11 +16,10 @@ from hsnoise._types import cfa_tile
 from hsnoise.draws import black_level_of
 from hsnoise.effects import BlackLevel, DarkCurrent, ReadNoise, ShotNoise
 from hsnoise.mosaic import electrons_of, mosaic
-from hsnoise.photometry import linear_from_display
+from hsnoise.photometry import GREY
 
 JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
-GREY = 0.2  # mean of linear light in ordinary pictures, of white
 NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
 
 
@@ -128,8 +127,8 @@ def _variance_e2(model: NoiseModel, light_e: float) -> float:
     """Temporal variance of sensor pixels in even light, mean over them, e-^2, from differences of frames."""
     light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
     counts = np.asarray(hsnoise.sample(jax.random.key(0), light, model), np.float64)
-    gain, tile = np.ravel(model["gain"].value), cfa_tile(model.cfa)
-    gain = np.tile(gain[tile % gain.size], [n // len(tile) for n in MATCH_SHAPE])
+    tile = cfa_tile(model.cfa)
+    gain = np.tile(np.asarray(model["gain"].value)[tile], [n // len(tile) for n in MATCH_SHAPE])
     return float(0.5 * np.mean((np.diff(counts, axis=0) / gain) ** 2))
 
 
@@ -144,12 +143,6 @@ def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseMod
             value = value * jnp.exp(rms * jax.random.normal(own, jnp.shape(value), jnp.float32))
             model = model.with_value(effect.name, field, value if spec.high is None else jnp.minimum(value, spec.high))
     return model
-
-
-def clean_of(frames, channels: int) -> jax.Array:
-    """Linear light [..., row, column, channel] of display values (uint8) [..., row, column, 3]; grey if mono."""
-    light = linear_from_display(jnp.asarray(frames, jnp.float32) / 255)
-    return light if channels == 3 else light.mean(-1, keepdims=True)
 
 
 def noisy_of(key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e) -> jax.Array:

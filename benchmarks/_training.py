@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks._noisy import Camera, clean_of, jittered, noisy_of
+from benchmarks._noisy import Camera, jittered, noisy_of
 from hsnoise import NoiseModel
 from hsnoise._keys import named_key
-from hsnoise.photometry import display_from_linear
+from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.stlstm import STLSTM, loss
 
 
@@ -96,7 +96,7 @@ def examples(batch, key, camera: NoiseModel, noise: NoiseModel, light) -> tuple[
 
     Each example has a camera of its own, about 10 % off, and a scene between the photoelectrons of white `light`.
     """
-    linear = clean_of(batch, len(camera.channels))
+    linear = light_of_frames(batch, len(camera.channels))
 
     def one(key, linear):
         of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))

@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 
 from benchmarks._clips import Clip
-from benchmarks._noisy import Camera, clean_of, noisy_of
+from benchmarks._noisy import Camera, noisy_of
 from hsnoise._output import write_atomically
-from hsnoise.photometry import display_from_linear
+from hsnoise.photometry import display_from_linear, frames_of_display, light_of_frames
 from hsnoise.stlstm import STLSTM
 
 CROP = 96
@@ -36,7 +36,7 @@ class Validation:
         side = min(CROP, *(n // 2 * 2 for clip in clips for n in clip.frames.shape[1:3]))
         for i, clip in enumerate(clips[:MOST_CLIPS]):
             row, column = ((n - side) // 2 for n in clip.frames.shape[1:3])
-            light = clean_of(clip.frames[:frames, row : row + side, column : column + side], camera.channels)
+            light = light_of_frames(clip.frames[:frames, row : row + side, column : column + side], camera.channels)
             clean.append(np.asarray(display_from_linear(light)))
             noisy.append(np.asarray(noisy_of(jax.random.key(i), light, camera.model, camera.model, white_e)))
         self.clean, self.noisy = np.stack(clean, 1), np.stack(noisy, 1).astype(np.float32)
@@ -50,7 +50,7 @@ class Validation:
         self.last = float(np.mean(values))
         rows = [np.asarray(display_from_linear(self.noisy[-1])), enhanced[-1], self.clean[-1]]
         picture = np.concatenate([np.concatenate(list(row), 1) for row in rows], 0)
-        pixels = (np.clip(picture, 0, 1) * 255).round().astype(np.uint8)
+        pixels = frames_of_display(picture)
         buffer = io.BytesIO()
         Image.fromarray(pixels.squeeze()).save(buffer, "PNG")
         write_atomically(self.out / f"validation-{step:08d}.png", buffer.getvalue())

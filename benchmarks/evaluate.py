@@ -19,16 +19,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from skimage.metrics import structural_similarity
 
 from benchmarks._clips import LONG, Clip, held_out, read_clips
-from benchmarks._noisy import OPTICS, Camera, camera_of, clean_of, noisy_of
+from benchmarks._noisy import OPTICS, Camera, camera_of, noisy_of
 from benchmarks._rivals import denoised, rivals, tuned
+from benchmarks._sheet import Sheet
 from benchmarks._validation import psnr_db
 from benchmarks.train import pair
-from hsnoise._output import write_atomically
-from hsnoise.photometry import display_from_linear
+from hsnoise._output import write_atomically, write_figure
+from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.weights import load_network
 
 LEVELS = 3
@@ -53,7 +53,7 @@ class Scene:
 def scene_of(clip: Clip, camera: Camera, white_e: float, crop: int, seed: int) -> Scene:
     side = [min(crop, n) // 2 * 2 for n in clip.frames.shape[1:3]]
     row, column = ((n - s) // 2 for n, s in zip(clip.frames.shape[1:3], side, strict=True))
-    light = clean_of(clip.frames[:, row : row + side[0], column : column + side[1]], camera.channels)
+    light = light_of_frames(clip.frames[:, row : row + side[0], column : column + side[1]], camera.channels)
     noisy = noisy_of(jax.random.key(seed), light, camera.model, camera.model, white_e)
     return Scene(clip.name, white_e, np.asarray(display_from_linear(light)), np.asarray(noisy, np.float32))
 
@@ -102,30 +102,22 @@ def mean_of(records: Sequence[dict], what: str, **chosen) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def tables(records: list[dict], unit_of_light) -> tuple[Table, str]:
-    """PSNR and SSIM of each method: all, and at each illuminance."""
+def tables(records: list[dict], unit_of_light) -> tuple[Sheet, Sheet]:
+    """PSNR and SSIM of each method, all and at each illuminance; PSNR of each clip."""
     methods, levels = list(dict.fromkeys(r["method"] for r in records)), sorted({r["white_e"] for r in records})
-    head = ["method", "PSNR / dB", "SSIM", *(f"PSNR at {unit_of_light(level)}" for level in levels)]
+    head = ("method", "PSNR / dB", "SSIM", *(f"PSNR at {unit_of_light(level)}" for level in levels))
     rows = [
-        [
+        (
             method,
             f"{mean_of(records, 'psnr_db', method=method):.2f}",
             f"{mean_of(records, 'ssim', method=method):.3f}",
             *(f"{mean_of(records, 'psnr_db', method=method, white_e=level):.2f}" for level in levels),
-        ]
+        )
         for method in methods
     ]
-    table = Table(*head)
-    for row in rows:
-        table.add_row(*row)
     clips = list(dict.fromkeys(r["clip"] for r in records))
-    by_clip = [[clip, *(f"{mean_of(records, 'psnr_db', method=m, clip=clip):.2f}" for m in methods)] for clip in clips]
-    return table, "\n\n".join([markdown(head, rows), markdown(["clip, PSNR / dB", *methods], by_clip)]) + "\n"
-
-
-def markdown(head: list[str], rows: list[list[str]]) -> str:
-    lines = [f"| {' | '.join(line)} |" for line in [head, ["---"] * len(head), *rows]]
-    return "\n".join(lines)
+    by_clip = [(clip, *(f"{mean_of(records, 'psnr_db', method=m, clip=clip):.2f}" for m in methods)) for clip in clips]
+    return Sheet("Held-out clips", head, rows), Sheet("PSNR of each clip, dB", ("clip", *methods), by_clip)
 
 
 def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
@@ -171,14 +163,6 @@ def draw_frames(scene: Scene, found: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path) -> None:
-    import io
-
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    write_atomically(path, buffer.getvalue())
-
-
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -218,18 +202,16 @@ def evaluate(options: argparse.Namespace) -> None:
         found = {name: method(scene) for name, method in methods.items()}
         records += [row for name, frames in found.items() for row in scores(name, scene, frames)]
         if level == middle:
-            save(draw_frames(scene, found), options.out / f"frames-{clip.name}.png")
+            write_figure(options.out / f"frames-{clip.name}.png", draw_frames(scene, found), dpi=110)
     long = []
     for number, clip in enumerate(c for c in kept if c.name.endswith(LONG)):
         scene = scene_of(clip, camera, middle, options.crop, 1000 + number)
         long += scores(OURS, scene, net(scene))
-    table, text = tables(records, unit_of_light)
-    Console(width=130).print(table)
-    write_atomically(options.out / "evaluation.md", text.encode())
-    save(
-        draw_curves(records, long or [r for r in records if r["method"] == OURS], unit_of_light),
-        options.out / "curves.png",
-    )
+    sheets = tables(records, unit_of_light)
+    Console(width=130).print(sheets[0].rich())
+    write_atomically(options.out / "evaluation.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
+    curves = draw_curves(records, long or [r for r in records if r["method"] == OURS], unit_of_light)
+    write_figure(options.out / "curves.png", curves, dpi=110)
     print(f"Written to {options.out}: evaluation.md, curves.png, frames-*.png")
 
 

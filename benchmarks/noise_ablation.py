@@ -17,6 +17,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import equinox as eqx
@@ -24,18 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 import hsnoise
 from benchmarks._clips import LONG, Clip, crops, held_out, read_clips
-from benchmarks._noisy import Camera, clean_of, matched
+from benchmarks._noisy import Camera, matched
+from benchmarks._sheet import Sheet
 from benchmarks._training import Recipe, Trainer, batch_rng
 from benchmarks._validation import psnr_db
-from benchmarks.evaluate import markdown
 from hsnoise import NoiseModel
 from hsnoise._output import write_atomically
 from hsnoise.mosaic import electrons_of
-from hsnoise.photometry import display_from_linear
+from hsnoise.photometry import GREY, display_from_linear, light_of_frames
 from hsnoise.weights import load_network, save_network
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
@@ -51,6 +51,20 @@ class Sensor:
     fitted: hsnoise.FrameStack
     unseen: np.ndarray
     exposure_s: float
+
+    @cached_property
+    def dark_sigma_dn(self) -> float:
+        """Temporal standard deviation of the fitted darks nearest in exposure, DN: from differences of frames."""
+        stack = self.fitted
+        darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
+        chosen = min(darks, key=lambda i: abs(stack.exposure_s[i] - self.exposure_s))
+        frames = np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
+        # Cosmic rays are rare and huge: the middle of the differences tells of the rest.
+        low, high = np.quantile(np.diff(frames, axis=0), [0.1587, 0.8413])
+        return float((high - low) / 2 / np.sqrt(2))
+
+    def dark_sigma_e(self, params: NoiseModel) -> float:
+        return self.dark_sigma_dn / float(np.mean(np.asarray(params["gain"].value)))
 
 
 def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
@@ -99,9 +113,10 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
         print(fit)
         params = at_exposure(fit.params, sensor.exposure_s)
         params.save(paths["paper"])
-        light_e = 0.2 * 4 * dark_sigma_e(sensor, params)
+        sigma = sensor.dark_sigma_e(params)
+        light_e = GREY * float(np.sqrt(DIM * BRIGHT)) * sigma
         for name in ("gaussian", "poisson-gaussian"):
-            matched(params, name, light_e, dark_sigma_e(sensor, params) ** 2).save(paths[name])
+            matched(params, name, light_e, sigma**2).save(paths[name])
     if not paths["improved"].exists():
         print(f"{sensor.name}: improving")
         story = hsnoise.improve(sensor.fitted, progress=lambda text: print(f"  {text} ...", flush=True))
@@ -114,42 +129,24 @@ def at_exposure(params: NoiseModel, exposure_s: float) -> NoiseModel:
     return NoiseModel(params.effects, cfa=params.cfa, shutter=params.shutter, exposure_s=exposure_s)
 
 
-def dark_sigma_e(sensor: Sensor, params: NoiseModel) -> float:
-    """Temporal standard deviation of the fitted darks at the exposure, e-: from differences of frames."""
-    stack = sensor.fitted
-    chosen = int(
-        np.argmin(
-            [
-                abs(t - sensor.exposure_s) + 1e9 * (k != "dark")
-                for t, k in zip(stack.exposure_s, stack.kind, strict=True)
-            ]
-        )
-    )
-    frames = np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
-    # Cosmic rays are rare and huge: the middle of the differences tells of the rest.
-    low, high = np.quantile(np.diff(frames, axis=0), [0.1587, 0.8413])
-    return float((high - low) / 2 / np.sqrt(2) / np.mean(np.asarray(params["gain"].value)))
-
-
-def trained(sensor: Sensor, name: str, models: dict[str, NoiseModel], clips, seed: int, options) -> Path:
-    """Weights of a network that was trained with one of the noises."""
-    path = options.out / f"{sensor.name}-{name}-{options.maps}-{options.steps}-{seed}.eqx"
+def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
+    """Weights of a network that was trained with the noise called `name`."""
+    path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}.eqx"
     if path.exists():
         return path
-    camera = camera_of(sensor, models["paper"])
-    trainer = Trainer(Recipe(maps=options.maps), options.steps, camera, models[name])
+    trainer = Trainer(Recipe(maps=options.maps), options.steps, camera, noise)
     state = trainer.start(seed)
-    text = f"{sensor.name}, {name}, seed {seed}"
+    text = f"{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
         batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, SIDE)
         state, value = trainer.step(state, batch, seed, step)
-    save_network(path, trainer.network(state), {"camera": sensor.name, "noise": name, "steps": options.steps})
+    save_network(path, trainer.network(state), {"camera": camera.name, "noise": name, "steps": options.steps})
     print(f"{text}: loss {float(value):.4f}", flush=True)
     return path
 
 
 def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
-    sigma = dark_sigma_e(sensor, paper)
+    sigma = sensor.dark_sigma_e(paper)
     return Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma))
 
 
@@ -163,7 +160,7 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
     n = min(len(sensor.unseen), len(clip.frames))
     side = min(CROP, *sensor.unseen.shape[1:], *clip.frames.shape[1:3])
     row, column = ((size - side) // 2 for size in clip.frames.shape[1:3])
-    light = np.asarray(clean_of(clip.frames[:n, row : row + side, column : column + side], 1))
+    light = np.asarray(light_of_frames(clip.frames[:n, row : row + side, column : column + side], 1))
     row, column = (rng.integers(size - side + 1) for size in sensor.unseen.shape[1:])
     dark = sensor.unseen[rng.permutation(len(sensor.unseen))[:n], row : row + side, column : column + side]
     gain = float(np.mean(np.asarray(camera.model["gain"].value)))
@@ -173,32 +170,29 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
 
 
 def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> list[float]:
-    """PSNR, dB, of each clip at each of several places of the sensor."""
+    """PSNR of each clip, dB, mean over several places of the sensor: places share what is hard about a clip."""
     net, _ = load_network(path)
     video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
-    values = []
-    for number, clip in enumerate(clips):
-        for place in range(places):
-            clean, noisy = real_scene(sensor, clip, camera, 1000 * number + place)
-            values.append(psnr_db(np.asarray(video(jnp.asarray(noisy))), clean))
-    return values
+
+    def psnr(clip: Clip, seed: int) -> float:
+        clean, noisy = real_scene(sensor, clip, camera, seed)
+        return psnr_db(np.asarray(video(jnp.asarray(noisy))), clean)
+
+    return [float(np.mean([psnr(clip, 1000 * i + place) for place in range(places)])) for i, clip in enumerate(clips)]
 
 
-def table_of(results: dict[str, dict[str, list[list[float]]]]) -> tuple[Table, str]:
+def table_of(results: dict[str, dict[str, list[list[float]]]]) -> Sheet:
     """Mean PSNR of each sensor and noise, and its gain over (b) with a standard error over clips and seeds."""
-    head = ["sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian"]
+    head = ("sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian")
     rows = []
     for sensor, of in results.items():
         row = [sensor, *(f"{np.mean(of[name]):.2f}" for name in NOISES)]
         for name in ("paper", "improved"):
-            apart = np.asarray(of[name]) - np.asarray(of["poisson-gaussian"])  # [seed, clip and place]
+            apart = np.asarray(of[name]) - np.asarray(of["poisson-gaussian"])  # [seed, clip]
             error = np.hypot(apart.mean(0).std(ddof=1) / np.sqrt(apart.shape[1]), between(apart.mean(1)))
             row.append(f"{apart.mean():+.2f} +- {error:.2f} dB")
-        rows.append(row)
-    table = Table(*head, title="PSNR on real dark frames, dB")
-    for row in rows:
-        table.add_row(*row)
-    return table, markdown(head, rows) + "\n"
+        rows.append(tuple(row))
+    return Sheet("PSNR on real dark frames, dB", head, rows)
 
 
 def between(means: np.ndarray) -> float:
@@ -232,12 +226,12 @@ def main(argv: list[str] | None = None) -> None:
         of: dict[str, list[list[float]]] = {noise: [] for noise in NOISES}
         for seed in range(options.seeds):
             for noise in NOISES:
-                path = trained(sensor, noise, models, train, seed, options)
+                path = trained(camera, noise, models[noise], train, seed, options)
                 of[noise].append(measured(sensor, path, camera, kept, options.places))
         results[name] = of
-        table, text = table_of(results)
-        Console(width=130).print(table)
-        write_atomically(options.out / "ablation.md", text.encode())
+        sheet = table_of(results)
+        Console(width=130).print(sheet.rich())
+        write_atomically(options.out / "ablation.md", sheet.markdown().encode())
         write_atomically(options.out / "ablation.json", json.dumps(results).encode())
 
 

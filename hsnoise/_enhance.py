@@ -12,12 +12,10 @@ from rich.progress import track
 from hsnoise.io import load
 from hsnoise.model import NoiseModel
 from hsnoise.mosaic import electrons_of
-from hsnoise.photometry import linear_from_display
+from hsnoise.photometry import GREY, frames_of_display, light_of_frames
 from hsnoise.stlstm import STLSTM, enhance
 from hsnoise.video import VIDEO, frame_rate_of, frames_of, write_video
 from hsnoise.weights import load_network
-
-GREY = 0.2  # mean of linear light in ordinary pictures, of white
 
 
 def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
@@ -45,8 +43,7 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
 
 def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
     for frame in frames_of(args.video):
-        light = np.asarray(linear_from_display(frame.astype(np.float32) / 255)) * args.brighten
-        yield light if net.channels == 3 else light.mean(-1, keepdims=True)
+        yield np.asarray(light_of_frames(frame, net.channels)) * args.brighten
 
 
 def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndarray]:
@@ -62,5 +59,5 @@ def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndar
 
 
 def _pixels(frame: np.ndarray) -> np.ndarray:
-    values = (np.clip(frame, 0, 1) * 255).round().astype(np.uint8)
+    values = frames_of_display(frame)
     return np.broadcast_to(values, (*values.shape[:2], 3))

@@ -34,6 +34,13 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:
+    """Write a Matplotlib figure as PNG, all or nothing; keywords of `savefig`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", **keywords)
+    write_atomically(path, buffer.getvalue())
+
+
 def frames_file(suffix: str, counts: np.ndarray, metadata: Mapping[str, Any]) -> bytes:
     """Content of a file of raw frames.
 

@@ -21,7 +21,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 import hsnoise
 from hsnoise import _enhance, _options, cameras, report
 from hsnoise._options import CAMERAS
-from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically
+from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically, write_figure
 from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
@@ -273,7 +273,7 @@ def _counter(say: Callable[[str], None], text: str) -> Callable[[], None]:
 def _show(found, path: Path) -> None:
     """Print a finding and draw its figure."""
     print(found)
-    _write_figure(path, found.plot())
+    write_figure(path, found.plot())
     print(f"Drawn in {path}")
 
 
@@ -284,12 +284,6 @@ def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords
     with _busy("Writing the report"):
         report.write_report(args.report, found, stack, files=args.paths, seed=args.seed, **keywords)
     print(f"Reported in {args.report}")
-
-
-def _write_figure(path: Path, figure) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
 
 
 def _model(name: str) -> NoiseModel:
@@ -377,7 +371,7 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
         if fit.physics.row_sigma is not None:
             drawings["row_spectrum.png"] = plots.row_spectrum
     for name, draw in drawings.items():
-        _write_figure(out / name, draw(fit))
+        write_figure(out / name, draw(fit))
     return ["model.json", "table.csv", *drawings]
 
 

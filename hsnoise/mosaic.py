@@ -50,15 +50,12 @@ def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scal
     if counts.ndim < 2 or counts.shape[-2] % period or counts.shape[-1] % period:
         raise ValueError(f"counts: expected even rows and columns for cfa {params.cfa}, got shape {counts.shape}")
     exposure_s = params.exposure_s if exposure_s is None else exposure_s
-    zero, one = np.zeros(1), np.ones(1)
-    black = params["black_level"].value if "black_level" in params else zero
-    gain = params["gain"].value if "gain" in params else one
+    channels = len(params.channels)
+    black = params["black_level"].value if "black_level" in params else np.zeros(channels)
+    gain = params["gain"].value if "gain" in params else np.ones(channels)
     dark = params["dark_current"].rate * exposure_s if "dark_current" in params else 0.0
-    planes = [[] for _ in range(int(tile.max()) + 1)]
+    planes: list[list[jax.Array]] = [[] for _ in range(channels)]
     for (row, column), channel in np.ndenumerate(tile):
         planes[channel].append(counts[..., row::period, column::period].astype(jnp.float32))
-    electrons = [
-        (sum(plane) / len(plane) - jnp.ravel(black)[i % jnp.size(black)]) / jnp.ravel(gain)[i % jnp.size(gain)] - dark
-        for i, plane in enumerate(planes)
-    ]
+    electrons = [(sum(plane) / len(plane) - black[i]) / gain[i] - dark for i, plane in enumerate(planes)]
     return jnp.stack(electrons, -1).astype(jnp.float32)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hsnoise.physics import flat_variance
 from hsnoise.result import FitResult
+from hsnoise.statistics import RowHistograms
 
 UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
 LEAST_OUTLIERS = 5  # pixels; fewer are chance
@@ -132,7 +135,7 @@ def _order_note(result: FitResult) -> list[str]:
     """Means that fall where the exposure grows."""
     for h in result.summary.histograms:
         order = np.argsort(result.summary.exposure_s, kind="stable")
-        level = h.row_sum.sum((1, 2))[order] / np.maximum(h.counts.sum((1, 2, 3), dtype=np.float64), 1)[order]
+        level = _levels([h])[order]
         if (np.diff(level) < -1).any():
             e = int(np.diff(level).argmin())
             short, long = result.summary.exposure_s[order[[e, e + 1]]]
@@ -148,7 +151,7 @@ def _light_note(result: FitResult) -> list[str]:
     exposures = result.summary.exposure_s
     if not len(exposures):
         return []
-    levels = _levels(result)
+    levels = _levels(result.summary.histograms)
     if len(levels) > 1 and np.ptp(exposures) == 0 and np.ptp(levels) > DRIFT_SIGMA * _noise_dn(result):
         return [
             f"All exposures are said to be {exposures[0]:g} s, yet their means differ, from {levels.min():.4g} to"
@@ -167,10 +170,10 @@ def _light_note(result: FitResult) -> list[str]:
     ]
 
 
-def _levels(result: FitResult) -> np.ndarray:
-    """Mean count of the darks [exposure], DN, over all channels."""
-    total = sum(h.row_sum.sum((1, 2)) for h in result.summary.histograms)
-    return total / np.maximum(sum(h.counts.sum((1, 2, 3), dtype=np.float64) for h in result.summary.histograms), 1)
+def _levels(histograms: Sequence[RowHistograms]) -> np.ndarray:
+    """Mean count [exposure], DN, over all these channels."""
+    total = sum(h.row_sum.sum((1, 2)) for h in histograms)
+    return total / np.maximum(sum(h.counts.sum((1, 2, 3), dtype=np.float64) for h in histograms), 1)
 
 
 def _noise_dn(result: FitResult) -> float:

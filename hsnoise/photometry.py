@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from hsnoise._types import is_traced
 
+GREY = 0.2  # mean of linear light in ordinary pictures, of white
 PLANCK_J_S = 6.62607015e-34  # exact since the SI of 2019, as is the speed of light
 LIGHT_SPEED_M_PER_S = 299_792_458.0
 LUMINOUS_EFFICACY_LM_PER_W = 683.0  # at 555 nm, where the eye is most sensitive
@@ -94,3 +95,17 @@ def display_from_linear(light: ArrayLike) -> Array:
     light = jnp.asarray(light, float)
     low = 0.0031308
     return jnp.where(light <= low, 12.92 * light, 1.055 * jnp.maximum(light, low) ** (1 / 2.4) - 0.055)
+
+
+def light_of_frames(frames: ArrayLike, channels: int) -> Array:
+    """Linear light [..., row, column, channel], white is 1, of display values (uint8) [..., row, column, 3].
+
+    channels: 3, or 1 for grey.
+    """
+    light = linear_from_display(jnp.asarray(frames, float) / 255)
+    return light if channels == 3 else light.mean(-1, keepdims=True)
+
+
+def frames_of_display(values: ArrayLike) -> np.ndarray:
+    """Display values as 8-bit pixels, clipped to 0 to 255."""
+    return (np.clip(np.asarray(values), 0, 1) * 255).round().astype(np.uint8)

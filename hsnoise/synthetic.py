@@ -191,8 +191,9 @@ class Problem:
     def share_of(self, step: np.ndarray) -> float:
         """How much of a step may be made at once: statistics are straight lines of the parameters only nearby."""
         n = len(self.centre)
-        base = np.abs(self.whiten @ step[:n]) / self.sizes
-        return min(1.0, LONGEST_STEP / max(np.abs(step[n:]).max(initial=0.0), base.max() / LONGEST_OF_BASE, 1e-12))
+        base, own = np.abs(self.whiten @ step[:n]) / self.sizes, np.abs(step[n:])
+        longest = max(base.max() / LONGEST_OF_BASE, own.max(initial=0.0) / LONGEST_STEP)
+        return min(1.0, 1 / max(longest, 1e-12))
 
     def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics(draw_capture(self.seed + number, self.at(y), self.part))
@@ -217,8 +218,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     measured, _ = problem.statistics(part)
     y = problem.start
     scale, weight = _weights(problem, y, tick)
-    prior, slopes = problem.prior, None
-    last_step, sure = np.inf, False
+    prior, last_step, sure = problem.prior, np.inf, False
     for iteration in range(1, MOST_ITERATIONS + 1):
         drawn = _draws(problem, y, tick)
         if not sure:

@@ -35,15 +35,6 @@ def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -
     write_atomically(path, json.dumps(header).encode() + b"\n" + content)
 
 
-def read_about(path: str | os.PathLike) -> dict[str, Any]:
-    """What the file of `write_arrays` says of itself.
-
-    Raises:
-        ValueError: for a file that is none, was cut off or changed.
-    """
-    return _read(path)[0]
-
-
 def read_arrays(path: str | os.PathLike, like: Any) -> tuple[Any, dict[str, Any]]:
     """The PyTree that `write_arrays` wrote, of the structure and shapes of `like`, and what it says of itself.
 
@@ -51,8 +42,12 @@ def read_arrays(path: str | os.PathLike, like: Any) -> tuple[Any, dict[str, Any]
         ValueError: for a file that is none, was cut off or changed, or holds arrays of other shapes.
     """
     about, content = _read(path)
+    return _restored(path, content, like), about
+
+
+def _restored(path: str | os.PathLike, content: bytes, like: Any) -> Any:
     try:
-        return eqx.tree_deserialise_leaves(io.BytesIO(content), like), about
+        return eqx.tree_deserialise_leaves(io.BytesIO(content), like)
     except (RuntimeError, EOFError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: holds arrays of another network or optimiser ({_first_line(error)})") from error
 
@@ -86,11 +81,11 @@ def load_network(path: str | os.PathLike) -> tuple[STLSTM, dict[str, Any]]:
     Raises:
         ValueError: for a file that holds no network, or was cut off or changed.
     """
-    about = read_about(path)
+    about, content = _read(path)
     if "network" not in about:
         raise ValueError(f"{path}: holds no network")
     like = eqx.filter_eval_shape(STLSTM, jax.random.key(0), **about["network"])
-    return read_arrays(path, like)[0], about
+    return _restored(path, content, like), about
 
 
 def sizes_of(net: STLSTM) -> dict[str, Any]:

@@ -67,3 +67,9 @@ def test_pytorch_takes_the_draws_without_a_copy():
         optimiser.step()
         losses.append(loss.item())
     assert losses[-1] < 0.2 * losses[0]
+
+
+def test_page_on_the_enhancer_runs():
+    page = {"__name__": "page"}
+    exec(compile(code_of("enhancer.md"), "enhancer.md", "exec"), page)
+    assert page["enhanced"].shape == (48, 64, 3) and np.isfinite(page["enhanced"]).all()

@@ -231,7 +231,7 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
     partly = first.score > EVIDENCE and left < NEAR_ENOUGH * worst
     if verdict == "nothing missing" or (verdict == "unexplained" and not partly):
         law = evidence.null
-    blamed = _worst_group(evidence, evidence.null)
+    blamed, remaining = _what_remains(evidence, evidence.null).group, _what_remains(evidence, law)
     nearest = names if partly else ()
     if verdict in ("nothing missing", "unexplained"):
         names = ()
@@ -240,21 +240,17 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
         verdict=verdict,
         best=first if names else None,
         names=names,
-        advice=_advice(verdict, names or nearest, first, blamed, _worst_group(evidence, law)),
-        unexplained=_what_remains(evidence, law),
+        advice=_advice(verdict, names or nearest, first, blamed, remaining.group),
+        unexplained=remaining,
     )
 
 
-def _worst_group(evidence: Evidence, law: Gaussian) -> str:
-    scores = law.normal_scores(evidence.z, evidence.groups)
-    return max(scores, key=scores.__getitem__)
-
-
 def _what_remains(evidence: Evidence, law: Gaussian) -> Unexplained:
-    z = law.standardised(evidence.z)
+    scores, z = law.normal_scores(evidence.z, evidence.groups), law.standardised(evidence.z)
+    worst = max(scores, key=scores.__getitem__)
     order = [i for i in np.argsort(-np.abs(z)) if abs(z[i]) > 3][:WORST]
     statistics = tuple(f"{evidence.names[i]} (z = {z[i]:+.1f})" for i in order)
-    return Unexplained(evidence.misfit(law), _worst_group(evidence, law), statistics)
+    return Unexplained(scores[worst], worst, statistics)
 
 
 def _advice(verdict: str, names: tuple[str, ...], first: Candidate, blamed: str, left: str) -> str:

@@ -261,6 +261,9 @@ def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
     return normal_of_bits(pixel_words(key, like.shape)[1]).astype(like.dtype)
 
 
+GAIN_DC_UNTIL = 0.3  # row gain that is nearly white has a mean, that of the paper's 1/f has none
+
+
 def coloured_normal(
     key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype, *, dc_until: float = 1.0
 ) -> jax.Array:

@@ -7,9 +7,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._types import Frames, PerChannel, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
-
-DC_UNTIL = 0.3  # row gain that is nearly white has a mean, that of the paper's 1/f has none
+from hsnoise.effects._base import GAIN_DC_UNTIL, AbstractEffect, Capture, Stage, coloured_normal, param
 
 
 class RowGain(AbstractEffect):
@@ -33,6 +31,8 @@ class RowGain(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(key, (frames, rows, len(capture.channels)), exponent, signal.dtype, dc_until=DC_UNTIL)
+        series = coloured_normal(
+            key, (frames, rows, len(capture.channels)), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL
+        )
         beta = 1 + self.sigma[None, None] * series
         return signal * capture.per_row(jnp.maximum(beta, 0))

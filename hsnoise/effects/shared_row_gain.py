@@ -7,9 +7,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
-
-DC_UNTIL = 0.3  # as of `row_gain`
+from hsnoise.effects._base import GAIN_DC_UNTIL, AbstractEffect, Capture, Stage, coloured_normal, param
 
 
 class SharedRowGain(AbstractEffect):
@@ -33,5 +31,5 @@ class SharedRowGain(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype, dc_until=DC_UNTIL)
+        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL)
         return signal * jnp.maximum(1 + self.sigma * series, 0)
