@@ -28,6 +28,7 @@ MOST_STEPS = 6
 MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 HELD_OUT_DRAWS = 40
+THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 MOVED_SIGMA = 2.0
 
@@ -146,13 +147,29 @@ def improve(
             result = _with_one_more(steps, candidate.effect, fitted)
             step = _step(result, fitted, held_out, candidate.name, last, seed, say)
             better = step.held_out - last.held_out > WORSE or np.isnan(step.held_out)
-            if better and step.comparison.error <= last.comparison.error:
+            if better and step.comparison.error <= last.comparison.error and _is_there(candidate.effect, result):
                 steps.append(step)
                 break
         else:
-            tried = " or ".join(candidate.name for candidate in nearest)
-            reason = f"Adding {tried} was tried, but held-out frames or statistics fit worse with it: it was left out"
-            return Story(tuple(steps), f"{reason}. {_end(found, last.comparison)}")
+            return Story(tuple(steps), _left_out([candidate.name for candidate in nearest], found, last.comparison))
+
+
+def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
+    """Whether some size of the effect, a number that may be 0, is beyond chance in a fit with it."""
+    sizes = [p.name for p in effect.parameters(result.params.channels) if p.spec.low == 0]
+    rows = [result.table[name] for name in sizes if name in result.names]
+    return not rows or any(value > THERE_SIGMA * error for value, error, _ in rows)
+
+
+def _left_out(tried: list[str], found: Diagnosis, comparison: Comparison) -> str:
+    names = " or ".join(tried)
+    reason = (
+        f"Adding {names} was tried, but it came out compatible with zero, or held-out frames or statistics fit worse"
+        " with it: it was left out."
+    )
+    if comparison.error <= CHANCE_ERROR:
+        return f"{reason} Without it the error is {comparison.error:.2f}, as chance gives."
+    return f"{reason} {_end(found, comparison)}"
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:

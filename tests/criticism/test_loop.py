@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -14,6 +15,7 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.criticism.improve import _is_there
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -150,6 +152,15 @@ def test_improve_finds_adds_and_ends(few_candidates):
     assert [step.added for step in story.steps] == [None, "dark_signal_nonuniformity"]
     assert story.errors[0] > 4 and story.errors[1] < 2.5
     assert "dark_signal_nonuniformity" in str(story) and "->" in str(story)
+
+
+@pytest.mark.parametrize(("sigma_e", "error_e", "there"), [(0.058, 0.036, False), (0.09, 0.02, True)])
+def test_step_compatible_with_zero_is_not_taken(sigma_e, error_e, there):
+    """Only sizes count: a period far from 0 does not make a pattern of no amplitude a find."""
+    rows = {"frame_offset.sigma": (sigma_e, error_e, "e-"), "row_noise.exponent": (1.0, 0.01, "")}
+    result = SimpleNamespace(params=MODEL, names=tuple(rows), table=rows)
+    assert _is_there(fx.FrameOffset(sigma_e), result) is there
+    assert _is_there(fx.RowNoise(1.0), result)  # its size was not fitted: nothing speaks against it
 
 
 def test_shrunk_law_is_that_of_its_draws():
