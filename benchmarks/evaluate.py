@@ -32,7 +32,8 @@ from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.weights import load_network
 
 LEVELS = 3
-REFER, OURS = "scaled input", "hsnoise ST-LSTM"
+REFER, OURS, ALONE = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, memory emptied before each frame"
+SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,19 @@ def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
 
 
 def network_of(path: Path, camera: Camera):
-    """The enhancer as a function of a scene. Raises ValueError for weights of another number of channels."""
+    """The enhancer as two functions of a scene: of the whole video, and of each frame as if it were the first.
+
+    Raises:
+        ValueError: weights of another number of channels.
+    """
     net, about = load_network(path)
     if net.channels != camera.channels:
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
     if about.get("camera") != camera.name:
         print(f"Note: {path} was trained for camera {about.get('camera')}, not {camera.name}")
     video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
-    return lambda scene: np.asarray(video(scene.noisy))
+    alone = eqx.filter_jit(lambda noisy: net.video(noisy[None])[0])
+    return lambda scene: np.asarray(video(scene.noisy)), lambda scene: np.asarray(alone(scene.noisy))
 
 
 def methods_of(net, tuning: Scene, untrained: bool) -> dict:
@@ -120,8 +126,18 @@ def tables(records: list[dict], unit_of_light) -> tuple[Sheet, Sheet]:
     return Sheet("Held-out clips", head, rows), Sheet("PSNR of each clip, dB", ("clip", *methods), by_clip)
 
 
+def memory_sheet(long: list[dict]) -> Sheet:
+    """What the frames before are worth: PSNR of frame n with and without them, mean over the long clips."""
+    shown = [f for f in SHOWN_FRAMES if any(r["frame"] == f - 1 for r in long)]
+    rows = [
+        (method, *(f"{mean_of(long, 'psnr_db', method=method, frame=f - 1):.2f}" for f in shown))
+        for method in (OURS, ALONE)
+    ]
+    return Sheet("PSNR against frame number, long clips, dB", ("", *(f"frame {f}" for f in shown)), rows)
+
+
 def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
-    """PSNR against illuminance (all methods) and against frame number (the enhancer, long clips)."""
+    """PSNR against illuminance (all methods) and against frame number (long clips), with and without memory."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     levels = sorted({r["white_e"] for r in records})
@@ -135,10 +151,12 @@ def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
     left.set_ylabel("PSNR (dB)")
     left.legend(fontsize=8)
     left.set_title("Against light", loc="left")
-    for clip in dict.fromkeys(r["clip"] for r in long):
-        own = [r for r in long if r["clip"] == clip and r["method"] == OURS]
-        frames = sorted({r["frame"] for r in own})
-        right.plot([f + 1 for f in frames], [mean_of(own, "psnr_db", frame=f) for f in frames], "o-", ms=3, label=clip)
+    for i, clip in enumerate(dict.fromkeys(r["clip"] for r in long)):
+        for method, style, about in ((OURS, "o-", ""), (ALONE, ":", ", memory emptied")):
+            own = [r for r in long if r["clip"] == clip and r["method"] == method]
+            frames = sorted({r["frame"] for r in own})
+            values = [mean_of(own, "psnr_db", frame=f) for f in frames]
+            right.plot([f + 1 for f in frames], values, style, ms=3, color=f"C{i}", label=f"{clip}{about}")
     right.set_xlabel("frame")
     right.set_ylabel("PSNR (dB)")
     right.legend(fontsize=8)
@@ -185,7 +203,7 @@ def evaluate(options: argparse.Namespace) -> None:
     camera = camera_of(options.camera, options.lux, options.white_e)
     train, kept = held_out(read_clips(options.clips))
     levels = np.geomspace(*camera.white_e, LEVELS)
-    net = network_of(options.weights, camera)
+    net, alone = network_of(options.weights, camera)
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
     lux = OPTICS.get(camera.name)
@@ -203,14 +221,16 @@ def evaluate(options: argparse.Namespace) -> None:
         records += [row for name, frames in found.items() for row in scores(name, scene, frames)]
         if level == middle:
             write_figure(options.out / f"frames-{clip.name}.png", draw_frames(scene, found), dpi=110)
+    # Without longer cuts, the clips themselves show how the memory fills.
     long = []
-    for number, clip in enumerate(c for c in kept if c.name.endswith(LONG)):
+    for number, clip in enumerate([c for c in kept if c.name.endswith(LONG)] or short):
         scene = scene_of(clip, camera, middle, options.crop, 1000 + number)
-        long += scores(OURS, scene, net(scene))
-    sheets = tables(records, unit_of_light)
-    Console(width=130).print(sheets[0].rich())
+        long += scores(OURS, scene, net(scene)) + scores(ALONE, scene, alone(scene))
+    sheets = (*tables(records, unit_of_light), memory_sheet(long))
+    for sheet in (sheets[0], sheets[-1]):
+        Console(width=130).print(sheet.rich())
     write_atomically(options.out / "evaluation.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
-    curves = draw_curves(records, long or [r for r in records if r["method"] == OURS], unit_of_light)
+    curves = draw_curves(records, long, unit_of_light)
     write_figure(options.out / "curves.png", curves, dpi=110)
     print(f"Written to {options.out}: evaluation.md, curves.png, frames-*.png")
 
