@@ -18,10 +18,10 @@ demo: $(VENV)/.installed
 	$(BIN)/hsnoise demo $(if $(DATA),--data "$(DATA)") $(ARGS)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 -m "not gpu and not browser and not benchmark" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not gpu and not browser and not benchmark" $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -24,6 +24,14 @@ def forget_compiled_programs():
     jax.clear_caches()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def keep_compiled_programs(tmp_path_factory, worker_id):
+    """On disk, for the modules to come and for the other workers: most of the tests' time is compilation."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder if worker_id == "master" else folder.parent  # workers have folders of their own in one
+    jax.config.update("jax_compilation_cache_dir", str(folder / "compiled"))
+
+
 @pytest.fixture
 def key():
     return jax.random.key(2019)
