@@ -75,12 +75,13 @@ def held_out(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
 
 
 def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
-    """Raise ValueError unless every clip has that many frames, and rows and columns of at least `side`."""
+    """Raise ValueError unless every clip has rows and columns of at least `side`, and half the frames or more."""
     for clip in clips:
         n, rows, columns = clip.frames.shape[:3]
-        if n < frames or min(rows, columns) < side:
+        if n < (frames + 1) // 2 or min(rows, columns) < side:
             raise ValueError(
-                f"clip {clip.name}: {n} frames of {rows} x {columns}; training takes {frames} frames of {side} x {side}"
+                f"clip {clip.name}: {n} frames of {rows} x {columns}; training takes {frames} frames (or half of them,"
+                f" forth and back) of {side} x {side}"
             )
 
 
@@ -106,14 +107,15 @@ def _moved(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: int, side: int) -> np.ndarray:
-    """Random pieces of random clips, mirrored at random: [batch, frame, row, column, 3] of uint8."""
+    """Random pieces of random clips, mirrored at random: [batch, frame, row, column, 3] of uint8.
+
+    Of a clip that is shorter, all frames from a random one on, forth and back.
+    """
     out = np.empty((batch, frames, side, side, 3), np.uint8)
     for i in range(batch):
         video = clips[rng.integers(len(clips))].frames
-        first, row, column = (
-            rng.integers(n - size + 1) for n, size in zip(video.shape[:3], (frames, side, side), strict=True)
-        )
-        piece = video[first : first + frames, row : row + side, column : column + side]
+        row, column = (rng.integers(n - side + 1) for n in video.shape[1:3])
+        piece = video[_places(len(video), frames, rng), row : row + side, column : column + side]
         if rng.integers(2):
             piece = piece[:, ::-1]
         if rng.integers(2):
@@ -124,3 +126,11 @@ def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: i
             piece = piece[::-1]
         out[i] = piece
     return out
+
+
+def _places(length: int, frames: int, rng: np.random.Generator) -> np.ndarray:
+    """Numbers of `frames` frames in a row; where the clip ends, they turn back."""
+    if length >= frames:
+        return rng.integers(length - frames + 1) + np.arange(frames)
+    round_trip = np.concatenate([np.arange(length), np.arange(length - 2, 0, -1)])
+    return round_trip[(rng.integers(len(round_trip)) + np.arange(frames)) % len(round_trip)]

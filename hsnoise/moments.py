@@ -9,6 +9,7 @@ from hsnoise.physics import Physics
 from hsnoise.statistics import RowHistograms, Summary
 
 CLAMPED_E = 6.0
+FURTHEST = 3.0  # factor between the gains that means and variances tell: beyond, the means tell something else
 
 
 def unclip(mean, variance):
@@ -37,6 +38,8 @@ def start_physics(summary: Summary, with_row_gain: bool = True, with_clamp: bool
     electrons = [np.maximum(signal, 0.0) / k for (signal, *_), k in zip(estimates, gain, strict=True)]
     t = summary.exposure_s
     rate = np.mean([(e * t).sum() / max((t * t).sum(), 1e-300) for e in electrons]) if t.any() else 0.0
+    if t.any():
+        gain = _of_one_rate(gain, rate * t, [signal for signal, *_ in estimates])
     read = np.mean(
         [
             np.median(np.maximum(variance / k**2 - e, 0.02 * variance / k**2))
@@ -53,6 +56,15 @@ def start_physics(summary: Summary, with_row_gain: bool = True, with_clamp: bool
         black_level=black,
         black_clamp=np.array([clamp for *_, clamp in estimates]) if with_clamp else None,
     )
+
+
+def _of_one_rate(gain, dark_e, signals):
+    """Gains with which all channels hold the same dark electrons [exposure]: means tell ratios better than variances.
+
+    Coloured rows have no common offset, so that a likelihood that starts far from the means has nowhere to put it.
+    """
+    told = np.array([(dark_e * x).sum() / max((dark_e**2).sum(), 1e-300) for x in signals])
+    return np.where((told > gain / FURTHEST) & (told < gain * FURTHEST), told, gain)
 
 
 def _start_of_flats(summary: Summary, with_row_gain: bool) -> Physics:

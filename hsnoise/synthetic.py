@@ -35,6 +35,8 @@ STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of a
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
+OFF_BOUNDS = 0.02  # share of the range between two bounds
+SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
 SHRINKAGE = 0.1
 MARGIN = 1.15
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
@@ -42,7 +44,7 @@ MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not
 
 @dataclass(frozen=True)
 class Knob:
-    """One number of an added effect: name in tables, its place, and bounds."""
+    """One number of an added effect: name in tables, its place, bounds, and for one without bounds its size."""
 
     label: str
     effect: str
@@ -50,14 +52,23 @@ class Knob:
     index: tuple[int, ...]
     low: float | None
     high: float | None
+    size: float = 1.0
 
     def forward(self, value: float) -> float:
-        """The unconstrained number that stands for it: a logarithm above its lower bound, or itself."""
-        return value if self.low is None else float(np.log(max(value - self.low, 1e-9)))
+        """The unconstrained number: a logarithm above a lower bound, a logit between two, else the value in sizes."""
+        if self.low is None:
+            return value / self.size
+        if self.high is None:
+            return float(np.log(max(value - self.low, 1e-9)))
+        share = (value - self.low) / (self.high - self.low)
+        share = OFF_BOUNDS if share < 1e-6 else min(share, 1 - OFF_BOUNDS)  # at a bound itself nothing could move it
+        return float(np.log(share / (1 - share)))
 
     def inverse(self, x: float) -> float:
-        value = x if self.low is None else self.low + np.exp(np.clip(x, -25, 25))
-        return float(value if self.high is None else min(value, self.high))
+        if self.low is None:
+            return float(x * self.size)
+        grown = np.exp(np.clip(x, -25, 25))
+        return float(self.low + (grown if self.high is None else (self.high - self.low) * grown / (1 + grown)))
 
     def read(self, model: NoiseModel) -> float:
         """The unconstrained number in `model`."""
@@ -71,7 +82,10 @@ class Knob:
 
     def slope(self, x: float) -> float:
         """d value / d x."""
-        return 1.0 if self.low is None else float(np.exp(np.clip(x, -25, 25)))
+        if self.low is None:
+            return self.size
+        grown = float(np.exp(np.clip(x, -25, 25)))
+        return grown if self.high is None else (self.high - self.low) * grown / (1 + grown) ** 2
 
 
 def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
@@ -81,8 +95,10 @@ def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
         effect = model[name]
         labels = iter(p.name for p in effect.parameters(model.channels))
         for field, spec in effect.specs().items():
-            places = [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]
-            found += [Knob(next(labels), name, field, place, spec.low, spec.high) for place in places]
+            for place in [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]:
+                value = abs(float(np.asarray(getattr(effect, field))[place]))
+                size = value if 0 < value < SMALL else 1.0
+                found.append(Knob(next(labels), name, field, place, spec.low, spec.high, size))
     return found
 
 

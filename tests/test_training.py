@@ -101,7 +101,7 @@ def test_another_run_in_the_same_folder_is_refused(folder, tmp_path, capsys):
         (["--lux", "0"], "above 0"),
         (["--clips", "nowhere"], "--clips: expected a folder"),
         (["--vgg", "nowhere.pth"], "--vgg: there is no file"),
-        (["--preset", "cpu"], "training takes 8 frames"),
+        (["--preset", "cpu"], "training takes 12 frames"),
     ],
 )
 def test_bad_input_is_named(folder, tmp_path, capsys, more, words):
@@ -121,6 +121,13 @@ def test_the_same_step_is_the_same_whatever_came_before(folder):
     assert float(first) == float(second)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_short_clip_is_played_forth_and_back():
+    frames = np.broadcast_to(np.arange(4, dtype=np.uint8)[:, None, None, None], (4, 8, 8, 3))
+    batch = crops([Clip("short", frames)], batch_rng(0, 0), 64, 7, 8)[:, :, 0, 0, 0].astype(int)
+    assert set(np.unique(np.abs(np.diff(batch)))) == {1}  # no jump, no frame twice
+    assert {0, 3} == set(batch.min(1)) | set(batch.max(1)) and len(np.unique(batch[:, 0])) == 4
 
 
 def test_examples_have_the_light_of_the_clip_as_their_mean():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,9 @@ from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pair, judge
+from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pairs, closest, judge
 from hsnoise.criticism.reference import measure, reference
-from hsnoise.criticism.refine import refined
+from hsnoise.criticism.refine import refined, refined_pair
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -33,6 +33,7 @@ from hsnoise.stack import as_stack
 DRAWS = 64
 GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
 AMPLITUDES, DETAILS, MOST_LIKELY = (0.35, 1.0, 2.5), 4, 10  # and those that are most likely
+MOST_PAIRS = 3  # that are refined, two effects at once
 NEAR = 0.8  # share of the best score that makes a candidate a leader
 MANY_DETAILS = 16  # of which the leaders' best are taken
 AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 6  # amplitudes, relative, at which the leaders are drawn again
@@ -144,7 +145,7 @@ def diagnose(
         judged = _looked_at(judged, len(judged), bench, evidence)
         judged = _closer(judged, bench, evidence)
         if judged[0].misfit > MISFIT_LEFT:
-            pair = best_pair(judged, evidence)
+            pair = _best_pair(judged, {**makers, **own}, bench, evidence)
     ranking = [one.candidate(evidence) for one in judged]
     laws = {one.of.name: one.of.law(one.amplitude, evidence.null) for one in judged}
     found = _verdict(ranking, pair, evidence, laws)
@@ -188,11 +189,25 @@ def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judg
     leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
     wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
     varied = [judge(of, evidence, np.array(of.amplitudes)) for of in bench.fingerprints(wanted, MANY_DETAILS)]
-    makers = {one.of.name: given(refined(one.candidate(evidence).effect, bench, evidence)) for one in varied}
+    makers = {one.of.name: given(*refined([one.candidate(evidence).effect], bench, evidence)) for one in varied}
     prints = bench.fingerprints({name: (maker, AROUND) for name, maker in makers.items()}, CLOSE_DETAILS)
     again = [judge(of, evidence, CLOSE) for of in prints]
     better = [max(pair, key=lambda one: one.score) for pair in zip(leaders, again, strict=True)]
     return _best_first([*better, *judged[len(leaders) :]])
+
+
+def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evidence: Evidence) -> Pair | None:
+    """Two effects that explain the capture together: of those that come nearest, refined one after the other."""
+    refined_ones: list[Pair] = []
+    for pair in best_pairs(judged, evidence, MOST_PAIRS):
+        if pair.score > judged[0].score + EVIDENCE:
+            # Details that were chosen for one alone are those that made up for the other: chosen again.
+            prints = bench.fingerprints({name: (makers[name], GLANCE) for name in pair.names}, MANY_DETAILS)
+            start = [closest(of, evidence, other) for of, other in zip(prints, pair.shifts[::-1], strict=True)]
+            refined_ones.append(refined_pair(pair, start, bench, evidence))
+            if refined_ones[-1].misfit < MISFIT_LEFT:
+                break
+    return max(refined_ones, key=lambda one: one.score, default=None)
 
 
 def _own(candidates: Any, model) -> dict[str, Maker]:
@@ -217,6 +232,8 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
     limit = min(left, allowed if left > allowed else MISFIT_LEFT)
     if pair is not None and pair.score > first.score + EVIDENCE and pair.misfit < limit:
         left, names, law = pair.misfit, pair.names, pair.law
+        found = dict(zip(names, pair.effects, strict=True))
+        ranking = [replace(c, effect=found.get(c.name, c.effect)) for c in ranking]
         ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
         first = ranking[0]
     verdict = "named"

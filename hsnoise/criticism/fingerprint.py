@@ -34,11 +34,7 @@ class Fingerprint:
 
     def law(self, amplitude: float, null: Gaussian) -> Gaussian:
         """Law of the statistics with the effect at `amplitude` in the sensor."""
-        shifts = self.at(amplitude)
-        mean = shifts.mean(0)
-        spread = shifts - mean
-        scatter = spread.T @ spread / max(len(shifts) - 1, 1)
-        return Gaussian(mean, null.covariance + scatter + np.diag((RELATIVE_ERROR * mean) ** 2))
+        return law_of(self.at(amplitude), null)
 
     def at(self, amplitude: float) -> np.ndarray:
         """Shifts [detail, statistic], interpolated between the amplitudes that were drawn, linear from 0."""
@@ -47,6 +43,19 @@ class Fingerprint:
         i = min(int(np.searchsorted(knots, amplitude, side="right")), len(knots) - 1)
         share = (amplitude - knots[i - 1]) / (knots[i] - knots[i - 1])
         return values[i - 1] + share * (values[i] - values[i - 1])
+
+
+def law_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True) -> Gaussian:
+    """Law of the statistics with something in the sensor that shifts them by one of `shifts` [detail, statistic].
+
+    of_details: their scatter is part of it.
+    """
+    mean = shifts.mean(0)
+    covariance = null.covariance + np.diag((RELATIVE_ERROR * mean) ** 2)
+    if of_details:
+        spread = shifts - mean
+        covariance = covariance + spread.T @ spread / max(len(shifts) - 1, 1)
+    return Gaussian(mean, covariance)
 
 
 @dataclass(frozen=True)

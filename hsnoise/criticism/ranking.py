@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from hsnoise.criticism.candidates import made
-from hsnoise.criticism.fingerprint import Fingerprint
+from hsnoise.criticism.fingerprint import Fingerprint, law_of
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.effects import AbstractEffect
 
@@ -85,9 +85,14 @@ class Judged:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two candidates that explain the capture together, the one with more evidence of its own first."""
+    """Two candidates that explain the capture together, the one with more evidence of its own first.
+
+    effects: both, ready to add; shifts: of the statistics [statistic], by each.
+    """
 
     names: tuple[str, str]
+    effects: tuple[AbstractEffect, AbstractEffect]
+    shifts: tuple[np.ndarray, np.ndarray]
     score: float
     misfit: float
     law: Gaussian
@@ -101,25 +106,43 @@ def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) ->
     return Judged(of, float(amplitudes[i]), scores[i], evidence.misfit(laws[i]))
 
 
-def best_pair(judged: list[Judged], evidence: Evidence) -> Pair | None:
-    """The pair that describes the capture best, of the leading candidates with all others; `judged` is best first."""
-    best: tuple[float, tuple[Judged, Judged], Gaussian] | None = None
+def best_pairs(judged: list[Judged], evidence: Evidence, number: int) -> list[Pair]:
+    """The pairs that describe the capture best, of the leading candidates with all others; `judged` is best first."""
+    found = []
     for i, first in enumerate(judged[:LEADERS]):
-        alone = [first.of.law(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude]
+        alone = {float(a): first.of.law(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude}
         for second in judged[i + 1 :]:
-            for law in _laws_together(alone, second, evidence.null):
-                score = evidence.score(law)
-                if best is None or score > best[0]:
-                    best = score, (first, second), law
-    if best is None:
-        return None
-    score, (first, second), law = best
-    return Pair((first.of.name, second.of.name), score, evidence.misfit(law), law)
+            laws = _laws_together(alone, second, evidence.null)
+            scored = [(evidence.score(law), amplitudes, law) for amplitudes, law in laws]
+            found.append((*max(scored, key=lambda one: one[0]), (first, second)))
+    best = sorted(found, key=lambda one: -one[0])[:number]
+    return [_pair(score, amplitudes, law, both, evidence) for score, amplitudes, law, both in best]
 
 
-def _laws_together(alone: list[Gaussian], second: Judged, null: Gaussian):
-    """Laws with both effects in the sensor, `alone` those of the first: shifts and scatters add."""
+def _pair(score: float, amplitudes, law: Gaussian, both, evidence: Evidence) -> Pair:
+    first, second = (replace(one, amplitude=a).candidate(evidence) for one, a in zip(both, amplitudes, strict=True))
+    shifts = [one.of.at(a).mean(0) for one, a in zip(both, amplitudes, strict=True)]
+    names, effects = (first.name, second.name), (first.effect, second.effect)
+    return Pair(names, effects, (shifts[0], shifts[1]), score, evidence.misfit(law), law)
+
+
+def closest(of: Fingerprint, evidence: Evidence, beside: np.ndarray) -> AbstractEffect:
+    """The effect with the amplitude and details that describe the capture best, with `beside` shifting it, too."""
+    best: tuple[float, float, int] | None = None
+    for amplitude in GRID:
+        shifts = of.at(float(amplitude))
+        law = law_of(shifts, evidence.null, of_details=False)
+        scores = [float(Gaussian(one + beside, law.covariance).log_density(evidence.z)) for one in shifts]
+        i = int(np.argmax(scores))
+        if best is None or scores[i] > best[0]:
+            best = scores[i], float(amplitude), i
+    assert best is not None  # GRID is not empty
+    return made(of.maker, *best[1:])
+
+
+def _laws_together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
+    """Amplitudes and laws with both effects in the sensor, `alone` those of the first: shifts and scatters add."""
     for b in PAIR_SECOND:
         other = second.of.law(float(b), null)
-        for one in alone:
-            yield Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)
+        for a, one in alone.items():
+            yield (a, float(b)), Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)

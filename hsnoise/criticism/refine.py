@@ -1,26 +1,31 @@
-"""A candidate's parameters brought closer to the capture: a few Gauss-Newton steps on simulated statistics."""
+"""Parameters of one or two candidates brought closer to the capture: a few Gauss-Newton steps on simulated draws."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
 from hsnoise._threads import in_threads
-from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench
-from hsnoise.criticism.ranking import Evidence
+from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench, law_of
+from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.synthetic import Knob, knobs
 
 ITERATIONS = 3
-DRAWS, SLOPE_DRAWS = 6, 3
+DRAWS, SLOPE_DRAWS, PAIR_DRAWS = 6, 3, 12
 STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA = 1.0
 
 
-def refined(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> AbstractEffect:
-    """`effect` with the parameters at which its draws come closest to the capture."""
-    model = bench.model.add(effect)
-    turned = knobs(model, (effect.name,))
+def refined(effects: Sequence[AbstractEffect], bench: Bench, evidence: Evidence) -> tuple[AbstractEffect, ...]:
+    """The effects, in the sensor together, with the parameters at which draws come closest to the capture."""
+    names = tuple(effect.name for effect in effects)
+    model = reduce(NoiseModel.add, effects, bench.model)
+    turned = knobs(model, names)
     y = np.array([knob.read(model) for knob in turned])
     for _ in range(ITERATIONS):
         shifts, slopes = _shifts_and_slopes(model, turned, y, bench)
@@ -30,7 +35,19 @@ def refined(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> Abstrac
         information = weighted @ slopes + np.eye(len(y)) / PRIOR_SIGMA**2
         step = np.linalg.solve(information, weighted @ (evidence.z - mean))
         y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    return _at(model, turned, y)[effect.name]
+    model = _at(model, turned, y)
+    return tuple(model[name] for name in names)
+
+
+def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evidence: Evidence) -> Pair:
+    """A pair with parameters refined together from `start`, and drawn together: strong effects do not just add."""
+    effects = refined(start, bench, evidence)
+    model = reduce(NoiseModel.add, effects, bench.model)
+    shifts = np.stack(in_threads(lambda number: bench.shift(model, number), range(PAIR_DRAWS), bench.tick))
+    law = law_of(shifts, evidence.null)
+    score = evidence.score(law)
+    again = replace(pair, effects=(effects[0], effects[1]), score=score, misfit=evidence.misfit(law), law=law)
+    return max(pair, again, key=lambda one: one.score)
 
 
 def _shifts_and_slopes(

@@ -46,7 +46,7 @@ def test_parameters_come_close_to_those_hidden(hidden, start, within, like):
     bench = Bench(CAMERA, darks, reference(CAMERA, darks, 24, 100), 100, nothing)
     null = shrunk(bench.base.own_z(), bench.slopes())
     z = bench.base.z(measure(darks, CAMERA).values)
-    found = refined(start, bench, Evidence(z, null, bench.base.names, bench.base.groups, 1))
+    (found,) = refined([start], bench, Evidence(z, null, bench.base.names, bench.base.groups, 1))
     for name, share in within.items():
         assert float(getattr(found, name)) == pytest.approx(float(getattr(hidden, name)), rel=share)
 
@@ -56,6 +56,6 @@ def test_settings_and_bounds_are_kept(like):
     bench = Bench(CAMERA, darks, reference(CAMERA, darks, 24, 100), 100, nothing)
     null = shrunk(bench.base.own_z(), bench.slopes())
     evidence = Evidence(np.zeros(len(bench.base.names)), null, bench.base.names, bench.base.groups, 1)
-    found = refined(fx.TapOffsets(1.0, taps=4), bench, evidence)
+    (found,) = refined([fx.TapOffsets(1.0, taps=4)], bench, evidence)
     assert found.taps == 4
     assert 0 <= float(found.sigma) < 0.8  # no offsets in this capture
