@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from hsnoise._frames import LazyFrames
+from hsnoise._types import Window
 
 KINDS = ("dark", "flat")
 
@@ -27,6 +28,19 @@ def span(name: str, value: Any, size: int) -> slice:
     if step not in (None, 1) or not 0 <= start < stop <= size:
         raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
     return slice(int(start), int(stop))
+
+
+def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
+    """Four numbers that say where frames of `shape` lie on a sensor. Raises ValueError if they lie outside."""
+    if window is None:
+        return None
+    numbers = tuple(int(n) for n in window)
+    if len(numbers) != 4 or min(numbers) < 0 or any(numbers[i] + shape[i] > numbers[i + 2] for i in (0, 1)):
+        raise ValueError(
+            f"window: expected (first row, first column, rows, columns) of a sensor that holds {shape[0]} x {shape[1]}"
+            f" frames, got {window}"
+        )
+    return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
 def exposure_groups(counts: Any) -> tuple[Any, ...]:

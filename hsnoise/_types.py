@@ -16,6 +16,7 @@ Frames = Float[Array, "frame row column"]
 FrameRows = Float[Array, "frame row channel"]  # one number for each row of each colour
 PixelMap = Float[Array, "1 row column"]
 Counts = UInt[Array, "frame row column"]
+Window = tuple[int, int, int, int]  # first row, first column, rows and columns of the sensor
 RandomKey = Key[Array, ""] | UInt32[Array, "2"]
 
 BAYER_CFAS = ("RGGB", "BGGR", "GRBG", "GBRG")

@@ -41,9 +41,12 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     first = 0
     if kept < columns:
         first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
-    part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, min(first + kept, columns)))
+    end = min(first + kept, columns)
+    part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
     counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
-    return FrameStack(counts, **_like(part))
+    # What depends on the place stays where it is on the sensor.
+    window = part.window or ((0, first, rows, columns) if end - first < columns else None)
+    return FrameStack(counts, **{**_like(part), "window": window})
 
 
 def check_fits(model: NoiseModel, stack: FrameStack) -> None:
@@ -55,6 +58,8 @@ def check_fits(model: NoiseModel, stack: FrameStack) -> None:
             f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
             " files do not say so, give it cfa= and shutter=)"
         )
+    if "adc" not in model:
+        raise ValueError("params: expected a model with the effect adc, which makes counts (DN)")
 
 
 def check_effects(model: NoiseModel, like: FrameStack) -> None:
@@ -94,9 +99,11 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
         own = jax.random.fold_in(named_key(key, "frames"), e)
         clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
-        drawn = sample_by_effect(own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key)
+        drawn = sample_by_effect(
+            own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key, window=like.window
+        )
         counts.append(np.asarray(drawn))
-    return FrameStack(counts, **_like(like))
+    return like.drawn(counts)
 
 
 def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
@@ -123,7 +130,7 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
 
 
 def _like(stack: FrameStack) -> dict[str, Any]:
-    keep = ("exposure_s", "white_level", "cfa", "shutter", "kind")
+    keep = ("exposure_s", "white_level", "cfa", "shutter", "kind", "window")
     return {name: getattr(stack, name) for name in keep}
 
 

@@ -24,7 +24,7 @@ from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
 from hsnoise._poisson import Regime, regime_of
-from hsnoise._types import RandomKey, Scalar, cfa_tile, channels_of, check_shutter, is_traced
+from hsnoise._types import RandomKey, Scalar, Window, cfa_tile, channels_of, check_shutter, is_traced
 from hsnoise.arrivals import Arrivals, merged
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
 
@@ -250,13 +250,20 @@ def sample_dark(
 
 
 def sample_by_effect(
-    key: RandomKey, clean: ArrayLike, params: NoiseModel, *, exposure_s: float | Scalar, sensor_key: RandomKey
+    key: RandomKey,
+    clean: ArrayLike,
+    params: NoiseModel,
+    *,
+    exposure_s: float | Scalar,
+    sensor_key: RandomKey,
+    window: Window | None = None,
 ) -> Array:
     """As `sample` of [frame, row, column], the same counts up to rounding, but each effect is compiled by itself.
 
     Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
+    window: as in FrameStack, where the frames lie on a larger sensor.
     """
-    return _apply(key, *_prepared(key, clean, params, exposure_s, sensor_key))
+    return _apply(key, *_prepared(key, clean, params, exposure_s, sensor_key, window))
 
 
 def dark_signals(
@@ -267,7 +274,7 @@ def dark_signals(
     return _signals(key, *_prepared(key, clean, params, exposure_s, None))
 
 
-def _prepared(key, clean, params, exposure_s, sensor_key):
+def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     """Checked input: photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
@@ -275,7 +282,9 @@ def _prepared(key, clean, params, exposure_s, sensor_key):
     clean, low, high = _check_clean(clean, params.cfa)
     exposure = _check_exposure(params.exposure_s if exposure_s is None else exposure_s)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
-    capture = Capture(jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter, sensor_key)
+    capture = Capture(
+        jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter, sensor_key, window=window
+    )
     effects = merged(params.effects, _regime(low, high, params, exposure))
     # A fit returns float64 parameters, whatever precision the session samples in.
     numbers, rest = eqx.partition(effects, eqx.is_inexact_array)

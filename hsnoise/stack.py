@@ -20,9 +20,10 @@ from hsnoise._arguments import (
     positive,
     span,
     temperatures,
+    window_of,
 )
 from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
-from hsnoise._types import BAYER_CFAS, SHUTTERS, channels_of
+from hsnoise._types import BAYER_CFAS, SHUTTERS, Window, channels_of
 
 BATCH = 64  # frames of a Dask array that are handed to its scheduler at a time
 
@@ -47,6 +48,8 @@ class FrameStack:
         temperature_c: sensor temperature, degrees Celsius, one for all or one a group (NaN: unknown).
         iso: ISO speed of all frames.
         row_axis: axis of a stored frame that counts sensor rows: 0, or 1 for frames stored in portrait.
+        window: (first row, first column, rows, columns) of the whole sensor where the frames are a part of it and
+            effects that depend on the place (glow, taps) are to be told in its coordinates; None: they are all of it.
 
     Attributes are the arguments, checked and brought to one shape: `counts` a tuple of arrays (as stored);
     `exposure_s`, `photons_e` and `temperature_c` arrays `[exposure]`, the last two None if nothing is known;
@@ -69,6 +72,7 @@ class FrameStack:
     temperature_c: np.ndarray | None
     iso: float | None
     row_axis: int
+    window: Window | None
 
     def __init__(
         self,
@@ -84,6 +88,7 @@ class FrameStack:
         temperature_c: Any = None,
         iso: float | None = None,
         row_axis: int = 0,
+        window: Window | None = None,
     ):
         groups = exposure_groups(counts)
         row_axis = one_of("row_axis", row_axis, (0, 1))
@@ -103,6 +108,7 @@ class FrameStack:
             "temperature_c": temperatures(temperature_c, len(groups)),
             "iso": None if iso is None else positive("iso", iso),
             "row_axis": row_axis,
+            "window": window_of(window, groups[0].shape[1:] if row_axis == 0 else groups[0].shape[:0:-1]),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -179,6 +185,18 @@ class FrameStack:
                 tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
             yield from dask.compute(*tasks)
 
+    def drawn(self, counts: Sequence[np.ndarray]) -> FrameStack:
+        """Simulated `counts`, an array an exposure in sensor orientation, taken as this stack was.
+
+        Their values are not checked: what would be a broken file may be a fair draw of a quiet camera.
+        """
+        unknown = {"black_level": None, "photons_e": None, "temperature_c": None, "iso": None, "row_axis": 0}
+        stack = object.__new__(FrameStack)
+        for name in self.__dataclass_fields__:
+            value = tuple(counts) if name == "counts" else unknown.get(name, getattr(self, name))
+            object.__setattr__(stack, name, value)
+        return stack
+
     def check(self) -> None:
         """Read the first frame of each exposure, check its values and the black level; call before long work.
 
@@ -211,7 +229,7 @@ class FrameStack:
         groups = np.arange(self.n_exposures)[slice(None) if exposures is None else list(exposures)]
         region = (columns, rows) if self.row_axis == 1 else (rows, columns)
         cfa = shift_cfa(self.cfa, rows.start, columns.start)
-        changes = {
+        changes: dict[str, Any] = {
             "counts": [crop(self.counts[i], *region, frames=frames) for i in groups],
             "cfa": transpose_cfa(cfa) if self.row_axis == 1 else cfa,
             "exposure_s": self.exposure_s[groups],
@@ -219,6 +237,9 @@ class FrameStack:
             "photons_e": None if self.photons_e is None else self.photons_e[groups],
             "temperature_c": None if self.temperature_c is None else self.temperature_c[groups],
         }
+        if self.window is not None:
+            row, column, *sensor = self.window
+            changes["window"] = (row + rows.start, column + columns.start, *sensor)
         return FrameStack(**{**self._arguments(), **changes})
 
     @staticmethod
@@ -231,7 +252,7 @@ class FrameStack:
         if not stacks:
             raise ValueError("join: expected at least one FrameStack, got none")
         first = stacks[0]
-        for name in ("shape", "row_axis", "cfa", "shutter", "black_level", "white_level", "iso"):
+        for name in ("shape", "row_axis", "window", "cfa", "shutter", "black_level", "white_level", "iso"):
             for other in stacks[1:]:
                 one, two = getattr(first, name), getattr(other, name)
                 if not np.array_equal(one, two):

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import hsnoise
+from benchmarks import simulator
 from hsnoise import maximise as maximise_module
 from hsnoise.model import sample_dark
+from hsnoise.moments import _of_one_rate
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 FRAMES, SHAPE = 4, (96, 128)
@@ -364,3 +366,19 @@ def test_what_cannot_be_darks_is_told(means, exposure_s, words):
     stack = hsnoise.FrameStack(counts, exposure_s, black_level=64, cfa="mono", shutter="global")
     result = hsnoise.fit(stack, method="line")
     assert any(words in note for note in result.notes)
+
+
+def test_a_start_gives_all_channels_the_same_dark_electrons():
+    """Where means and variances nearly agree the means decide; where they do not, something else moves the means."""
+    dark_e, gain = np.array([1.0, 5.0, 10.0]), np.array([1.5, 0.9, 1.2])
+    told = _of_one_rate(gain, dark_e, [1.3 * dark_e, 1.2 * dark_e, 9.0 * dark_e])
+    np.testing.assert_allclose(told, [1.3, 1.2, 1.2])
+
+
+@pytest.mark.slow
+def test_rows_that_conflict_with_the_start_do_not_end_a_fit():
+    """Hot pixels and row noise once gave a start at which the likelihood of coloured rows was no number."""
+    hidden = ("row_noise", "hot_pixels")
+    counts = simulator.capture(simulator.CAMERAS["canon"], hidden, 1.0, np.random.default_rng(4))
+    result = hsnoise.fit(counts, exposure_s=EXPOSURE_S, black_level=0, white_level=65535, cfa="RGGB", shutter="rolling")
+    assert result.method == "ml" and result.outcome.startswith("converged")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hsnoise
+from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
 from hsnoise.synthetic import Problem, _as_scattered, fit_synthetic, knobs
 
@@ -73,3 +74,21 @@ def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
     for name, (value, _) in TRUTH.table().items():
         found, error, _ = fit.table[name]
         assert abs(found - value) <= 4 * error, f"{name}: {found} +- {error}, truth {value}"
+
+
+@pytest.mark.parametrize(
+    ("effect", "label"),
+    [
+        (fx.AmplifierGlow(10.0, 0.3), "amplifier_glow.row"),  # at its upper bound
+        (fx.AmplifierGlow(10.0, 0.3, row=0.0), "amplifier_glow.row"),  # at its lower bound
+        (fx.HotPixels(0.004, 300.0), "hot_pixels.fraction"),
+        (fx.Nonlinearity(1e-5), "nonlinearity.curvature"),  # tiny in its unit
+    ],
+)
+def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, label):
+    model = hsnoise.cameras.grasshopper3().add(effect)
+    (knob,) = [k for k in knobs(model, (effect.name,)) if k.label == label]
+    x = knob.read(model)
+    start, ahead = knob.inverse(x), knob.inverse(x + 0.2)
+    assert 0.002 < (ahead - start) / (start or 1.0) < 0.3
+    assert knob.slope(x) == pytest.approx((knob.inverse(x + 1e-6) - knob.inverse(x - 1e-6)) / 2e-6, rel=1e-3)

@@ -32,6 +32,7 @@ class Scale:
     gain: np.ndarray
     frames: int
     has_exposure: bool
+    exposures_differ: bool  # of the darks
     light: float  # most photoelectrons of a flat, e-
 
     @staticmethod
@@ -45,6 +46,7 @@ class Scale:
             gain=np.asarray(model["gain"].value, float),
             frames=max(part.n_frames[i] for i in darks),
             has_exposure=longest > 0,
+            exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
         )
 
@@ -128,7 +130,7 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
         "cosmic_rays": cosmic,
         "dark_current_drift": lambda f, rng: fx.DarkCurrentDrift(0.5 * f * s.read_noise / (s.longest_s * s.frames)),
     }
-    if s.rate * s.longest_s > LEAST_ELECTRONS:
+    if s.exposures_differ and s.rate * s.longest_s > LEAST_ELECTRONS:
         level = s.gain * s.rate
         makers["black_clamp"] = lambda f, rng: fx.BlackClamp(level * min(0.7 * f, 1.0))
     return makers

@@ -24,7 +24,7 @@ def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> 
     model = bench.model
     if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
         return None
-    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(bench.part.exposure_s) == 0:
+    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(fitted.summary.exposure_s) == 0:
         return None
     try:
         clamped = fit(fitted.summary, model=model.add(BlackClamp(0.0)))

@@ -13,7 +13,7 @@ from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
-from hsnoise.stack import as_stack
+from hsnoise.stack import FrameStack, as_stack
 
 DRAWS = 40
 WORST = 5  # statistics told in words
@@ -96,8 +96,16 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
         log_likelihood_per_pixel=_per_pixel(params, darks_of(part)),
-        skipped=measured.skipped,
+        skipped=(*measured.skipped, *_left_out(stack, part)),
     )
+
+
+def _left_out(stack: FrameStack, part: FrameStack) -> tuple[str, ...]:
+    """What of a large capture was not looked at."""
+    if part.window is None or part.shape == stack.shape:
+        return ()
+    first = part.window[1] - (0 if stack.window is None else stack.window[1])
+    return (f"only columns {first} to {first + part.shape[1] - 1} of {stack.shape[1]} were compared: large capture",)
 
 
 def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:

@@ -124,6 +124,8 @@ def diagnose(
             returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
     tick = progress or (lambda: None)
+    if draws < MANY_DETAILS:
+        raise ValueError(f"draws: expected at least {MANY_DETAILS}, got {draws}")
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
@@ -210,11 +212,20 @@ def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evi
     return max(refined_ones, key=lambda one: one.score, default=None)
 
 
-def _own(candidates: Any, model) -> dict[str, Maker]:
-    makers = {}
+def check_candidates(candidates: Any) -> tuple[AbstractEffect, ...]:
+    """The candidates of a user. Raises TypeError unless they are effects."""
+    if isinstance(candidates, AbstractEffect):
+        raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
+    candidates = tuple(candidates)
     for effect in candidates:
         if not isinstance(effect, AbstractEffect):
             raise TypeError(f"candidates: expected effects (instances of AbstractEffect), got {effect!r}")
+    return candidates
+
+
+def _own(candidates: Any, model) -> dict[str, Maker]:
+    makers = {}
+    for effect in check_candidates(candidates):
         if effect.name in model:
             raise ValueError(f"candidates: {effect.name} is in the model already")
         makers[effect.name] = given(effect)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise.criticism.compare import Comparison, compare
-from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, diagnose
+from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
@@ -126,7 +126,7 @@ def improve(
         TypeError, ValueError: bad input, before any long work.
     """
     say = progress or (lambda sentence: None)
-    stack = as_stack(stack, **keywords)
+    stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
     say("Fitting the paper's model")
     result = fit(fitted, model=model)
@@ -144,21 +144,41 @@ def improve(
             return Story(tuple(steps), _end(found, last.comparison))
         for candidate in nearest:
             say(f"Adding {candidate.name}")
-            result = _with_one_more(steps, candidate.effect, fitted)
+            try:
+                result = _with_one_more(steps, candidate.effect, fitted)
+            except (RuntimeError, ValueError) as error:
+                say(f"{candidate.name} cannot be fitted here: {error}")
+                continue
             step = _step(result, fitted, held_out, candidate.name, last, seed, say)
-            better = step.held_out - last.held_out > WORSE or np.isnan(step.held_out)
-            if better and step.comparison.error <= last.comparison.error and _is_there(candidate.effect, result):
+            if _is_better(step, last) and _is_there(candidate.effect, result):
                 steps.append(step)
                 break
         else:
             return Story(tuple(steps), _left_out([candidate.name for candidate in nearest], found, last.comparison))
 
 
+def _is_better(step: Step, before: Step) -> bool:
+    """Whether statistics, and frames that no fit has seen, fit better or as well with what was added."""
+    # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
+    seen = np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params)
+    return step.comparison.error <= before.comparison.error and (seen or step.held_out - before.held_out > WORSE)
+
+
 def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
-    """Whether some size of the effect, a number that may be 0, is beyond chance in a fit with it."""
-    sizes = [p.name for p in effect.parameters(result.params.channels) if p.spec.low == 0]
+    """Whether some size of the effect is beyond chance in a fit with it.
+
+    Sizes may be 0 and have no upper bound, unlike places and shares; of an effect without any, numbers of either sign
+    count, or shares.
+    """
+    found = effect.parameters(result.params.channels)
+    kinds = (
+        [p.name for p in found if p.spec.low == 0 and p.spec.high is None],
+        [p.name for p in found if p.spec.low is None],
+        [p.name for p in found if p.spec.low == 0],
+    )
+    sizes = next((names for names in kinds if names), [])
     rows = [result.table[name] for name in sizes if name in result.names]
-    return not rows or any(value > THERE_SIGMA * error for value, error, _ in rows)
+    return not rows or any(abs(value) > THERE_SIGMA * error for value, error, _ in rows)
 
 
 def _left_out(tried: list[str], found: Diagnosis, comparison: Comparison) -> str:
@@ -175,7 +195,8 @@ def _left_out(tried: list[str], found: Diagnosis, comparison: Comparison) -> str
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
     """What to try: the effect that is named, or else those that explain most of what none explains alone."""
     if found.best is not None:
-        return (found.best,)
+        alike = [one for one in found.ranking if one.name in found.names]
+        return tuple(alike) if found.verdict == "ambiguous" else (found.best,)
     if found.verdict == "nothing missing":
         return ()
     return tuple(one for one in found.ranking[:MOST_TRIED] if one.score > EVIDENCE)
@@ -185,7 +206,9 @@ def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack
     model = steps[-1].fit.params.add(effect)
     if effect.name in WITH_LIKELIHOOD:
         return fit(fitted, model=model)
-    base = next(step.fit for step in reversed(steps) if step.fit.method != "synthetic")
+    base = next((step.fit for step in reversed(steps) if step.fit.method != "synthetic"), None)
+    if base is None or any(name in WITH_LIKELIHOOD and name not in base.params for name in model.names):
+        return fit(fitted, model=model)
     return fit_synthetic(base, fitted, model)
 
 
@@ -227,6 +250,8 @@ def _end(found: Diagnosis, comparison: Comparison) -> str:
         if comparison.error > CHANCE_ERROR:
             return f"No effect stands out, but something weak may be left: the error is {comparison.error:.2f}."
         return f"Nothing significant is left (error {comparison.error:.2f})."
+    if found.names:
+        return f"Still {found.headline}, but no refit with it held (error {comparison.error:.2f})."
     advice = f": {found.advice}" if found.advice else ""
     return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
 

@@ -35,6 +35,7 @@ from hsnoise._types import (
     PixelMap,
     RandomKey,
     Scalar,
+    Window,
     cfa_tile,
     channels_of,
     is_traced,
@@ -115,12 +116,13 @@ class Capture(eqx.Module):
 
     Attributes:
         exposure_s: exposure in seconds, scalar.
-        shape: rows and columns of the sensor.
+        shape: rows and columns of the frames.
         cfa: "mono" or a 2x2 Bayer string.
         shutter: "rolling" or "global".
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
         differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
+        window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
     """
 
     exposure_s: Scalar
@@ -130,6 +132,22 @@ class Capture(eqx.Module):
     sensor_key: RandomKey
     read_noise_scale: Frames | PixelMap | None = None
     differentiable: bool = eqx.field(static=True, default=False)
+    window: Window | None = eqx.field(static=True, default=None)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Numbers of the frames' rows on the sensor."""
+        return np.arange(self.shape[0]) + (0 if self.window is None else self.window[0])
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Numbers of the frames' columns on the sensor."""
+        return np.arange(self.shape[1]) + (0 if self.window is None else self.window[1])
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """Rows and columns of the sensor."""
+        return self.shape if self.window is None else self.window[2:]
 
     def rounded(self, signal: Frames) -> Frames:
         """The nearest whole numbers; their derivative is that of the signal if it is wanted."""

@@ -34,9 +34,9 @@ class AmplifierGlow(AbstractEffect):
     aspect: Scalar = param("1", low=0.1, high=10, default=1.0, doc="width of the glow over its height")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        last_row, last_column = capture.shape[0] - 1, capture.shape[1] - 1
-        down = jnp.arange(last_row + 1, dtype=signal.dtype) - self.row * last_row
-        right = (jnp.arange(last_column + 1, dtype=signal.dtype) - self.column * last_column) / self.aspect
+        last_row, last_column = (n - 1 for n in capture.sensor_shape)
+        down = jnp.asarray(capture.rows, signal.dtype) - self.row * last_row
+        right = (jnp.asarray(capture.columns, signal.dtype) - self.column * last_column) / self.aspect
         squared = (down[:, None] ** 2 + right[None] ** 2) / max(last_row**2 + last_column**2, 1)
         # The small term keeps the derivative finite in the spot itself.
         distance = jnp.sqrt(squared + 1e-12)

@@ -29,8 +29,11 @@ class CosmicRays(AbstractEffect):
     charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        where, how_much = jax.random.split(key)
+        where, again, how_much = jax.random.split(key, 3)
         probability = -jnp.expm1(-1e-6 * self.rate * capture.exposure_s)
-        hit = jax.random.uniform(where, signal.shape, signal.dtype) < probability
+        # Two uniform numbers for one: those of float32 have steps of 1e-7, and hits may be a thousand times rarer.
+        root = jnp.sqrt(probability)
+        one, other = (jax.random.uniform(key, signal.shape, signal.dtype) for key in (where, again))
+        hit = (one < root) & (other < root)
         charge = jnp.round(self.charge * jax.random.exponential(how_much, signal.shape, signal.dtype))
         return signal + jnp.where(hit, charge, 0)

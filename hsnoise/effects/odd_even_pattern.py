@@ -30,6 +30,6 @@ class OddEvenPattern(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         width = 1 if capture.cfa == "mono" else 2
-        chain = (jnp.arange(capture.shape[1]) // width) % 2
-        half = (chain.astype(signal.dtype) - 0.5)[None, None]
+        chain = (capture.columns // width) % 2
+        half = jnp.asarray(chain - 0.5, signal.dtype)[None, None]
         return signal * (1 + half * self.gain_mismatch) + half * self.offset

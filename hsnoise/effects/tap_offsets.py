@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from hsnoise._types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
@@ -36,7 +35,6 @@ class TapOffsets(AbstractEffect):
             raise ValueError(f"tap_offsets.taps: expected a whole number of at least 2, got {self.taps!r}.")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        columns = capture.shape[1]
-        tap = jnp.arange(columns) * self.taps // columns
+        tap = capture.columns * self.taps // capture.sensor_shape[1]
         offsets = jax.random.normal(capture.fixed_key(self.name), (self.taps,), signal.dtype)
         return signal + self.sigma * offsets[tap][None, None]

@@ -163,6 +163,32 @@ def test_step_compatible_with_zero_is_not_taken(sigma_e, error_e, there):
     assert _is_there(fx.RowNoise(1.0), result)  # its size was not fitted: nothing speaks against it
 
 
+def test_sizes_count_not_places():
+    glow = fx.AmplifierGlow(0.1, 0.3)
+    rows = {"amplifier_glow.rate": (0.1, 5.0, "e-/s"), "amplifier_glow.row": (0.5, 0.1, "1")}
+    assert not _is_there(glow, SimpleNamespace(params=MODEL, names=tuple(rows), table=rows))
+    rows = {"odd_even_pattern.offset": (-0.5, 0.1, "e-"), "odd_even_pattern.gain_mismatch": (0.0, 0.1, "1")}
+    assert _is_there(fx.OddEvenPattern(-0.5), SimpleNamespace(params=MODEL, names=tuple(rows), table=rows))
+
+
+def test_a_large_capture_keeps_its_place_on_the_sensor():
+    """A strip of the frames is drawn, and a glow or taps of the whole frames stay where they are."""
+    truth = MODEL.add(fx.AmplifierGlow(60.0, 0.3)).add(fx.TapOffsets(2.0, taps=8))
+    stack = draw_capture(3, truth, empty_stack(frames=8, shape=(480, 640)))
+    comparison = hsnoise.compare(truth, stack, draws=8)
+    assert comparison.error < 3
+    assert any("columns" in sentence for sentence in comparison.skipped)
+    assert darks_of(darks_of(stack)).window == darks_of(stack).window
+
+
+def test_a_capture_of_one_exposure_is_offered_no_clamp():
+    darks = darks_of(empty_stack(exposure_s=(0.1,)))
+    assert "black_clamp" not in library.built_in(
+        hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0), darks
+    )
+    assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
+
+
 def test_shrunk_law_is_that_of_its_draws():
     rng = np.random.default_rng(3)
     z = rng.standard_normal((4000, 6)) @ np.linalg.cholesky(0.5 * np.eye(6) + 0.5).T
@@ -188,6 +214,9 @@ def test_large_captures_are_cut_but_keep_their_rows():
         (lambda s: hsnoise.diagnose(MODEL, s, candidates=[3]), TypeError, "candidates"),
         (lambda s: hsnoise.diagnose(MODEL, s, candidates=[fx.Gain(2.0)]), ValueError, "gain"),
         (lambda s: hsnoise.diagnose(3, s), TypeError, "fit"),
+        (lambda s: hsnoise.diagnose(MODEL, s, draws=4), ValueError, "draws"),
+        (lambda s: hsnoise.compare(MODEL.remove("adc"), s), ValueError, "adc"),
+        (lambda s: hsnoise.improve(s, candidates=fx.RowNoise(1.0)), TypeError, "candidates"),
         (lambda s: hsnoise.fit(hsnoise.summarise(s), model=MODEL.add(fx.RowNoise(0.1))), ValueError, "frames"),
     ],
 )

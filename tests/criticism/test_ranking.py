@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from hsnoise import effects as fx
+from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.gaussian import Gaussian
-from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pair, judge
+from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pairs, closest, judge
 
 decide = importlib.import_module("hsnoise.criticism.diagnose")._verdict  # the package has a function of that name
 
@@ -57,16 +58,36 @@ def test_two_effects_are_found_together():
     found = evidence(PRINTS[0], PRINTS[2])
     judged = sorted((judge(of, found) for of in PRINTS), key=lambda one: -one.score)
     assert judged[0].misfit > 4
-    pair = best_pair(judged, found)
+    pair, other = best_pairs(judged, found, 2)
+    assert pair.score >= other.score and [effect.name for effect in pair.effects] == ["row_noise"] * 2
     assert set(pair.names) == {"left", "right"} and pair.misfit < 3 and pair.score > judged[0].score + 10
-    assert best_pair(judged[:1], found) is None
+    assert best_pairs(judged[:1], found, 3) == []
+
+
+def test_details_are_chosen_beside_what_else_is_there():
+    """The first detail looks like the other effect; with that in the sensor, the second is the right one."""
+
+    def maker(amplitude, rng):
+        return fx.RowNoise(amplitude * (1 + rng.random()))
+
+    shifts = np.zeros((1, 2, STATISTICS))
+    shifts[0, 0, :5], shifts[0, 1, 5:10] = 12.0, 12.0
+    of, other = Fingerprint("places", maker, (1.0,), shifts), PRINTS[0].at(2.0).mean(0)
+    found = evidence()
+    found = replace(found, z=found.z + other + shifts[0, 1])
+    alone, beside = (float(closest(of, found, shift).sigma) for shift in (0 * other, other))
+    ratios = [float(made(maker, 1.0, detail).sigma) for detail in (0, 1)]
+    grid = np.geomspace(0.15, 5.0, 18)
+    assert np.isclose(alone, ratios[0] * grid, rtol=1e-4).any()
+    assert np.isclose(beside, ratios[1] * grid, rtol=1e-4).any()
 
 
 NULL = Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS))
 
 
 def pair_of(names: tuple[str, str], score: float, misfit: float) -> Pair:
-    return Pair(names, score, misfit, NULL)
+    effects, shifts = (fx.RowNoise(2.0), fx.RowNoise(3.0)), (np.zeros(STATISTICS), np.zeros(STATISTICS))
+    return Pair(names, effects, shifts, score, misfit, NULL)
 
 
 def verdict(left: float, pair: Pair | None, worst: float = 20.0):

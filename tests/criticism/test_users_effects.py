@@ -66,4 +66,4 @@ def test_candidate_that_does_nothing(monkeypatch):
     module = importlib.import_module("hsnoise.criticism.diagnose")  # the package has the function of that name
     monkeypatch.setattr(module, "built_in", lambda model, darks: {})
     with pytest.raises(ValueError, match="my_effect changed no count of 12 captures"):
-        hsnoise.diagnose(CAMERA, COUNTS, candidates=[Mine(lambda signal: signal)], draws=8, **CAPTURE)
+        hsnoise.diagnose(CAMERA, COUNTS, candidates=[Mine(lambda signal: signal)], draws=16, **CAPTURE)
