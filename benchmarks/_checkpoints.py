@@ -43,12 +43,17 @@ def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]
     Raises:
         ValueError: there are checkpoints, and none can be read.
     """
-    found = checkpoints(folder)
+    found, damaged = checkpoints(folder), []
     for path in found:
         try:
-            return read_arrays(path, like)
+            result = read_arrays(path, like)
         except ValueError as error:
-            say(f"{error}; taking the one before")
+            say(f"{error}; taking the one before" if path != found[-1] else f"{error}")
+            damaged.append(path)
+            continue
+        for one in damaged:  # else it would count as one of the last two
+            one.rename(one.with_suffix(".damaged"))
+        return result
     if found:
         raise ValueError(f"{folder}: none of its {len(found)} checkpoints can be read; remove them to start anew")
     return None

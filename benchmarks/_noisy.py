@@ -118,7 +118,8 @@ def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: floa
         black_level = black_level_of(model)
     else:
         effects = [ReadNoise(float(np.sqrt(variance_e2)))]
-        black_level = black_level_of(model) + np.asarray(model["gain"].value) * dark_e
+        clamp = np.asarray(model["black_clamp"].rate) * model.exposure_s if "black_clamp" in model else 0.0
+        black_level = black_level_of(model) + np.asarray(model["gain"].value) * dark_e - clamp
     effects += [model["gain"], BlackLevel(jnp.asarray(black_level)), *([model["adc"]] if "adc" in model else [])]
     return NoiseModel(effects, cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
 
@@ -126,7 +127,9 @@ def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: floa
 def _variance_e2(model: NoiseModel, light_e: float) -> float:
     """Temporal variance of sensor pixels in even light, mean over them, e-^2, from differences of frames."""
     light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
-    counts = np.asarray(hsnoise.sample(jax.random.key(0), light, model), np.float64)
+    # Before clipping: the simpler noise is clipped, too.
+    open_ended = model.remove("adc") if "adc" in model else model
+    counts = np.asarray(hsnoise.sample(jax.random.key(0), light, open_ended), np.float64)
     tile = cfa_tile(model.cfa)
     gain = np.tile(np.asarray(model["gain"].value)[tile], [n // len(tile) for n in MATCH_SHAPE])
     return float(0.5 * np.mean((np.diff(counts, axis=0) / gain) ** 2))

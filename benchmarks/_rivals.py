@@ -15,7 +15,7 @@ from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 
 from hsnoise.photometry import display_from_linear
 
-STRENGTHS = (0.5, 1.0, 2.0)
+STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 WEIGHT_OF_SIGMA = 0.8  # of total variation, for a noise of 1
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]  # frames [frame, row, column, channel], sigma

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,6 +36,14 @@ class Recipe:
 def batch_rng(seed: int, step: int) -> np.random.Generator:
     """Of the crops of one step: a resumed run takes those that an uninterrupted one takes."""
     return np.random.default_rng([seed, step])
+
+
+def digest_of(*trees: Any) -> str:
+    """A hash of all that is in them: names of what things are, and numbers."""
+    found = hashlib.sha256(str(jax.tree.structure(trees)).encode())
+    for leaf in jax.tree.leaves(trees):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()
 
 
 class Trainer:

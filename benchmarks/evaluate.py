@@ -21,17 +21,18 @@ from rich.console import Console
 from rich.progress import track
 from skimage.metrics import structural_similarity
 
-from benchmarks._clips import LONG, Clip, held_out, read_clips
+from benchmarks._clips import LONG, Clip, check_sizes, held_out, read_clips
 from benchmarks._noisy import OPTICS, Camera, camera_of, noisy_of
 from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._sheet import Sheet
 from benchmarks._validation import psnr_db
 from benchmarks.train import pair
 from hsnoise._output import write_atomically, write_figure
-from hsnoise.photometry import display_from_linear, light_of_frames
+from hsnoise.photometry import display_from_linear, light_of_frames, linear_from_display
 from hsnoise.weights import load_network
 
 LEVELS = 3
+LEAST_CROP, LEAST_FRAMES = 8, 3
 REFER, OURS, ALONE = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, memory emptied before each frame"
 SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
 
@@ -47,8 +48,9 @@ class Scene:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the noise, from frame to frame."""
-        return float(np.sqrt(0.5 * np.mean(np.diff(self.noisy - self.clean, axis=0) ** 2)))
+        """Standard deviation of the noise in linear light, from frame to frame."""
+        noise = self.noisy - np.asarray(linear_from_display(self.clean))
+        return float(np.sqrt(0.5 * np.mean(np.diff(noise, axis=0) ** 2)))
 
 
 def scene_of(clip: Clip, camera: Camera, white_e: float, crop: int, seed: int) -> Scene:
@@ -75,15 +77,18 @@ def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
     ]
 
 
-def network_of(path: Path, camera: Camera):
+def network_of(path: Path, camera: Camera, scored: Sequence[Clip]):
     """The enhancer as two functions of a scene: of the whole video, and of each frame as if it were the first.
 
     Raises:
-        ValueError: weights of another number of channels.
+        ValueError: weights of another number of channels, or trained on clips that are to be scored.
     """
     net, about = load_network(path)
     if net.channels != camera.channels:
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
+    seen = sorted({clip.source for clip in scored} & {name.removesuffix(LONG) for name in about.get("clips", ())})
+    if seen:
+        raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
     if about.get("camera") != camera.name:
         print(f"Note: {path} was trained for camera {about.get('camera')}, not {camera.name}")
     video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
@@ -200,10 +205,14 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
+    if options.crop < LEAST_CROP:
+        raise ValueError(f"--crop: expected at least {LEAST_CROP} pixels, as SSIM needs, got {options.crop}")
+    options.out.mkdir(parents=True, exist_ok=True)
     camera = camera_of(options.camera, options.lux, options.white_e)
     train, kept = held_out(read_clips(options.clips))
+    check_sizes([*train, *kept], LEAST_FRAMES, LEAST_CROP)
     levels = np.geomspace(*camera.white_e, LEVELS)
-    net, alone = network_of(options.weights, camera)
+    net, alone = network_of(options.weights, camera, kept)
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
     lux = OPTICS.get(camera.name)
@@ -213,8 +222,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
     short = [clip for clip in kept if not clip.name.endswith(LONG)]
     tasks = [(clip, float(level)) for clip in short for level in levels]
-    records, options.out = [], options.out
-    options.out.mkdir(parents=True, exist_ok=True)
+    records = []
     for number, (clip, level) in enumerate(track(tasks, "Scoring", console=Console(stderr=True))):
         scene = scene_of(clip, camera, level, options.crop, number)
         found = {name: method(scene) for name, method in methods.items()}

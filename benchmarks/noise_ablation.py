@@ -27,10 +27,10 @@ from rich.console import Console
 from rich.progress import track
 
 import hsnoise
-from benchmarks._clips import LONG, Clip, crops, held_out, read_clips
+from benchmarks._clips import LONG, Clip, check_sizes, crops, held_out, read_clips
 from benchmarks._noisy import Camera, matched
 from benchmarks._sheet import Sheet
-from benchmarks._training import Recipe, Trainer, batch_rng
+from benchmarks._training import Recipe, Trainer, batch_rng, digest_of
 from benchmarks._validation import psnr_db
 from hsnoise import NoiseModel
 from hsnoise._output import write_atomically
@@ -112,11 +112,11 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
         fit = hsnoise.fit(sensor.fitted)
         print(fit)
         params = at_exposure(fit.params, sensor.exposure_s)
-        params.save(paths["paper"])
         sigma = sensor.dark_sigma_e(params)
         light_e = GREY * float(np.sqrt(DIM * BRIGHT)) * sigma
         for name in ("gaussian", "poisson-gaussian"):
             matched(params, name, light_e, sigma**2).save(paths[name])
+        params.save(paths["paper"])  # the last: it says that all three are there
     if not paths["improved"].exists():
         print(f"{sensor.name}: improving")
         story = hsnoise.improve(sensor.fitted, progress=lambda text: print(f"  {text} ...", flush=True))
@@ -131,7 +131,8 @@ def at_exposure(params: NoiseModel, exposure_s: float) -> NoiseModel:
 
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
-    path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}.eqx"
+    what = digest_of(noise, camera.model, [clip.frames for clip in clips])[:8]
+    path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
         return path
     trainer = Trainer(Recipe(maps=options.maps), options.steps, camera, noise)
@@ -215,9 +216,18 @@ def main(argv: list[str] | None = None) -> None:
     known, asked = sensors(folder), options.sensors.split(",")
     if not folder.is_dir() or set(asked) - set(known):
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
+    for option in ("seeds", "steps", "maps", "places"):
+        if getattr(options, option) < 1:
+            parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")
+    try:
+        train, kept = held_out(read_clips(options.clips))
+        kept = [clip for clip in kept if not clip.name.endswith(LONG)]
+        check_sizes([*train, *kept], FRAMES, SIDE)
+    except (ValueError, ImportError) as error:
+        parser.error(str(error))
+    if len(kept) < 2:
+        parser.error("--clips: expected at least two held-out videos (eight in all), for an error over clips")
     options.out.mkdir(parents=True, exist_ok=True)
-    train, kept = held_out(read_clips(options.clips))
-    kept = [clip for clip in kept if not clip.name.endswith(LONG)]
     results: dict[str, dict[str, list[list[float]]]] = {}
     for name in asked:
         sensor = known[name]()

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from benchmarks import _checkpoints, _vgg
 from benchmarks._clips import check_sizes, crops, held_out, read_clips
 from benchmarks._noisy import NOISES, OPTICS, camera_of, noise_of
-from benchmarks._training import Recipe, Trainer, batch_rng
+from benchmarks._training import Recipe, Trainer, batch_rng, digest_of
 from benchmarks._validation import Validation
 from hsnoise._output import write_atomically
 from hsnoise.weights import save_network
@@ -57,7 +58,7 @@ PRESETS = {
 def run(options: argparse.Namespace, console: Console) -> Path:
     """Train, or go on training; returns the weights file."""
     preset = chosen_preset(options)
-    perceptual = perceptual_of(options.vgg, console)
+    perceptual, vgg = perceptual_of(options.vgg, console)
     camera = camera_of(options.camera, options.lux, options.white_e)
     noise = noise_of(options.noise, camera)
     train, kept = held_out(read_clips(options.clips))
@@ -70,7 +71,12 @@ def run(options: argparse.Namespace, console: Console) -> Path:
         "seed": options.seed,
         "clips": [clip.name for clip in train],
         "held_out": [clip.name for clip in kept],
-        "vgg": None if options.vgg is None else options.vgg.name,
+        "vgg": vgg,
+        "digests": {
+            "camera": digest_of(camera.model),
+            "noise": digest_of(noise),
+            "clips": digest_of([clip.frames for clip in (*train, *kept)]),
+        },
     }
     check_same_run(options.out, about)
     console.print(f"{len(train)} clips to train on, held out: {', '.join(clip.name for clip in kept)}")
@@ -87,6 +93,8 @@ def run(options: argparse.Namespace, console: Console) -> Path:
         console.print(f"Going on from step {first}")
     state = loop(trainer, state, first, preset, train, validation, about, options, console)
     path = options.out / ENDED
+    if math.isnan(validation.last):  # nothing was left to train
+        validation.measure(trainer.network(state), preset.steps)
     save_network(path, trainer.network(state), {**about, "psnr_db": validation.last})
     console.print(f"Weights in {path}, log in {options.out / 'log.csv'}")
     return path
@@ -138,13 +146,13 @@ def chosen_preset(options: argparse.Namespace) -> Preset:
 
 
 def perceptual_of(vgg: Path | None, console: Console):
-    """Features for the perceptual term; the first line of the log says which."""
+    """Features for the perceptual term and the hash of their weights; the first line of the log says which."""
     if vgg is None:
         console.print("Perceptual term of the loss: off, no VGG-16 weights given (--vgg)")
-        return None
+        return None, None
     state, digest = _vgg.read_weights(vgg)
     console.print(f"Perceptual term of the loss: {_vgg.name_of(digest)}, relu2_2")
-    return _vgg.features_of(state)
+    return _vgg.features_of(state), digest
 
 
 def check_same_run(out: Path, about: dict) -> None:

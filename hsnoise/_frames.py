@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import mmap
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hsnoise._types import channels_of
+
+
+def in_order(path: Path) -> list[Any]:
+    """What frames are sorted by: their names, numbers in them by their size."""
+    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
 
 
 class LazyFrames:

@@ -161,8 +161,14 @@ def _enhance_arguments(commands: Any) -> None:
     enhance.add_argument("out", type=Path, metavar="OUT", help="video file to write: .mp4, .mkv, ...")
     enhance.add_argument("--weights", type=Path, required=True, metavar="FILE", help="weights.eqx of a training run")
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
+    enhance.add_argument("--exposure", type=_numbers, metavar="S", help="of raw frames, where their files do not say")
+    enhance.add_argument(
+        "--cfa", type=_cfa, metavar="CFA", help="Bayer order of raw frames, where it is not the model's"
+    )
     enhance.add_argument("--brighten", type=float, default=1.0, metavar="X", help="times more light (default 1)")
-    enhance.add_argument("--tile", type=_positive, metavar="PIXELS", help="work in tiles, in less memory, such as 256")
+    enhance.add_argument(
+        "--tile", type=_positive, metavar="PIXELS", help="work in tiles of so many, in less memory: 256, say"
+    )
     enhance.add_argument("--rate", type=float, default=25, help="frames a second of what says none (default 25)")
 
 

@@ -36,8 +36,8 @@ def mosaic(light: ArrayLike, cfa: str) -> jax.Array:
 def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scalar | None = None) -> jax.Array:
     """Colour frames of electrons, e- [..., row / 2, column / 2, 3], of counts [..., row, column] of a camera.
 
-    Black level and mean dark current are taken off: without noise and clipping, these are the photoelectrons of a
-    sensor pixel. Of a mono sensor [..., row, column, 1].
+    Black level (less what a black clamp subtracts) and mean dark current are taken off: without noise and clipping,
+    these are the photoelectrons of a sensor pixel. Of a mono sensor [..., row, column, 1].
 
     Args:
         counts: DN; params: the camera; exposure_s: exposure, s, that of `params` by default.
@@ -52,6 +52,8 @@ def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scal
     exposure_s = params.exposure_s if exposure_s is None else exposure_s
     channels = len(params.channels)
     black = params["black_level"].value if "black_level" in params else np.zeros(channels)
+    if "black_clamp" in params:
+        black = black - np.asarray(params["black_clamp"].rate) * exposure_s
     gain = params["gain"].value if "gain" in params else np.ones(channels)
     dark = params["dark_current"].rate * exposure_s if "dark_current" in params else 0.0
     planes: list[list[jax.Array]] = [[] for _ in range(channels)]

@@ -21,6 +21,7 @@ from hsnoise._types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 FORGET_BIAS = 1.0
+REACH = 16  # blocks beyond a tile that the network looks at
 L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equation 10
 
 
@@ -230,18 +231,22 @@ def from_blocks(x: jax.Array, stride: int) -> jax.Array:
     return x.reshape(batch, rows * stride, columns * stride, -1)
 
 
-def enhance(net: STLSTM, frames: Iterable[np.ndarray], *, tile: int | None = None, margin: int = 32) -> Iterator:
+def enhance(
+    net: STLSTM, frames: Iterable[np.ndarray], *, tile: int | None = None, margin: int | None = None
+) -> Iterator[np.ndarray]:
     """Enhance a video of any length in constant memory.
 
     Args:
         net: the network; frames: [row, column, channel], linear light, one after the other.
         tile: side of the tiles into which large frames are cut, pixels; None: whole frames. The result is that of
             whole frames wherever the network does not look further than `margin` pixels beyond a tile.
-        margin: pixels that tiles overlap, a multiple of the stride.
+        margin: pixels that tiles overlap, a multiple of the stride; default: 16 strides, more than a frame and those
+            just before it reach.
 
     Raises:
         ValueError: for a tile or margin that the stride does not divide; frames that change size.
     """
+    margin = REACH * net.stride if margin is None else margin
     if tile is not None and (tile <= 0 or tile % net.stride or margin < 0 or margin % net.stride):
         raise ValueError(f"tile, margin: expected multiples of the stride {net.stride}, got {tile}, {margin}")
     step = eqx.filter_jit(lambda net, frame, state: net(frame, state))

@@ -13,7 +13,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from hsnoise._frames import in_order
+
 VIDEO = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+WRITTEN = tuple(suffix for suffix in VIDEO if suffix != ".webm")  # those that hold H.264
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 QUALITY = {"crf": "16"}  # of x264: hard to tell from the original
 
@@ -28,10 +31,12 @@ def is_clip(path: Path) -> bool:
 def frames_of(path: str | os.PathLike) -> Iterator[np.ndarray]:
     """Frames [row, column, 3] of uint8, display values in R, G, B, one after the other.
 
-    path: a video file, a folder of images (in the order of their names), or an .npz (array `frames`) or .npy file.
+    path: a video file, a folder of images (in the order of their names, numbers by their size), or an .npz (array
+        `frames`) or .npy file.
 
     Raises:
-        ValueError: an unknown format, no frames, frames of several sizes, or a video that cannot be read.
+        ValueError: an unknown format, no frames, frames of several sizes, images of more than 8 bits or with an
+            alpha channel, or a video that cannot be read.
         ImportError: a video file, and PyAV is not installed.
     """
     path = Path(path)
@@ -75,8 +80,8 @@ def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fra
     suffix, ImportError without PyAV.
     """
     path = Path(path)
-    if path.suffix.lower() not in VIDEO:
-        raise ValueError(f"{path}: expected a video file, ending in {', '.join(VIDEO)}")
+    if path.suffix.lower() not in WRITTEN:
+        raise ValueError(f"{path}: expected a video file, ending in {', '.join(WRITTEN)}")
     av = _av(path)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     count = 0
@@ -86,6 +91,8 @@ def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fra
             stream.pix_fmt = "yuv420p"
             for frame in frames:
                 rows, columns = (n - n % 2 for n in frame.shape[:2])
+                if min(rows, columns) < 2:
+                    raise ValueError(f"frames: expected at least 2 x 2 pixels, got {frame.shape[0]} x {frame.shape[1]}")
                 if not count:
                     stream.width, stream.height = columns, rows
                 count += 1
@@ -131,12 +138,18 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
 def _images(folder: Path) -> Iterator[np.ndarray]:
     from PIL import Image, UnidentifiedImageError
 
-    for path in sorted(child for child in folder.iterdir() if child.suffix.lower() in IMAGES):
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES and not path.name.startswith(".")]
+    for path in sorted(paths, key=in_order):
         try:
             with Image.open(path) as image:
-                yield np.asarray(image.convert("RGB"))
+                if image.mode.startswith(("I", "F")):
+                    raise ValueError(f"{path}: expected 8 bits a channel, display values; got mode {image.mode}")
+                if "A" in image.getbands() or "transparency" in image.info:
+                    raise ValueError(f"{path}: expected an image without an alpha channel")
+                pixels = np.asarray(image.convert("RGB"))
         except (UnidentifiedImageError, OSError) as error:
             raise ValueError(f"{path}: cannot be read as an image ({error})") from error
+        yield pixels
 
 
 def _array(path: Path) -> np.ndarray:

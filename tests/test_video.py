@@ -41,6 +41,20 @@ def test_folders_and_arrays(tmp_path):
         np.testing.assert_array_equal(np.stack(list(frames_of(path))), FRAMES)
 
 
+def test_numbers_in_names_count(tmp_path):
+    for i in (1, 2, 10):
+        Image.fromarray(np.full((8, 8, 3), i, np.uint8)).save(tmp_path / f"frame{i}.png")
+    Image.fromarray(FRAMES[0]).save(tmp_path / "._frame1.png", format="PNG")
+    assert [int(frame[0, 0, 0]) for frame in frames_of(tmp_path)] == [1, 2, 10]
+
+
+@pytest.mark.parametrize(("mode", "words"), [("I;16", "8 bits"), ("F", "8 bits"), ("RGBA", "alpha"), ("LA", "alpha")])
+def test_images_that_are_no_display_values(tmp_path, mode, words):
+    Image.new(mode, (8, 8)).save(tmp_path / "0.tif")
+    with pytest.raises(ValueError, match=words):
+        list(frames_of(tmp_path))
+
+
 def test_bad_clips_are_told(tmp_path):
     (tmp_path / "empty").mkdir()
     np.savez(tmp_path / "grey.npz", frames=FRAMES[..., 0])

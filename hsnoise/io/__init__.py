@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -16,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsnoise._arguments import KINDS, numbers, one_of, span
-from hsnoise._frames import crop, shift_cfa
+from hsnoise._frames import crop, in_order, shift_cfa
 from hsnoise.io._grouping import group_by_exposure, group_counts, group_exposure_s, group_temperature_c
 from hsnoise.io._recording import UNKNOWN_ORDER, Recording
 from hsnoise.stack import FrameStack
@@ -106,9 +105,9 @@ def _paths(path: Any) -> list[Path]:
         paths = [Path(one) for one in path]
     elif Path(path).is_dir():
         found = [one for one in Path(path).iterdir() if one.is_file() and not one.name.startswith(".")]
-        paths = sorted(filter(_reader_name, found), key=_natural)
+        paths = sorted(filter(_reader_name, found), key=in_order)
     elif glob.has_magic(str(path)) and not Path(path).exists():
-        paths = sorted(filter(_reader_name, map(Path, glob.glob(str(path)))), key=_natural)
+        paths = sorted(filter(_reader_name, map(Path, glob.glob(str(path)))), key=in_order)
     else:
         paths = [Path(path)]
     if not paths:
@@ -117,10 +116,6 @@ def _paths(path: Any) -> list[Path]:
         if not one.is_file():
             raise FileNotFoundError(f"path: no such file: {one}")
     return paths
-
-
-def _natural(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
 
 
 def _reader_name(path: Path) -> str | None:
