@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -19,7 +20,7 @@ from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
 from hsnoise._types import cfa_tile
 from hsnoise.effects import ADC, BlackLevel, Gain, ReadNoise, ShotNoise
 from hsnoise.photometry import display_from_linear
-from hsnoise.weights import load_network
+from hsnoise.weights import load_network, save_network
 
 TINY = train.Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
 
@@ -91,6 +92,32 @@ def test_another_run_in_the_same_folder_is_refused(folder, tmp_path, capsys):
         train.main(arguments(folder, tmp_path / "run", "--seed", "1"))
     assert "another run (seed differ" in capsys.readouterr().err
     assert json.loads((tmp_path / "run" / "run.json").read_text())["seed"] == 0
+
+
+def test_another_model_of_the_same_name_is_another_run(folder, tmp_path, capsys):
+    path = tmp_path / "model.json"
+    for black_level_dn in (0, 64):
+        hsnoise.cameras.canon_5d3(black_level_dn=black_level_dn).save(path)
+        run = arguments(folder, tmp_path / "run", "--camera", str(path), "--white-e", "2,10")
+        if black_level_dn == 0:
+            train.main(run)
+    with pytest.raises(SystemExit):
+        train.main(run)
+    assert "another run (digests differ" in capsys.readouterr().err
+
+
+def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
+    tree = {"weight": jnp.arange(3.0)}
+    for step in (100, 200):
+        _checkpoints.write(tmp_path, step, tree, {})
+    cut = _checkpoints.checkpoints(tmp_path)[0]
+    cut.write_bytes(cut.read_bytes()[:-4])
+    said = []
+    assert _checkpoints.read_newest(tmp_path, tree, said.append)[1]["step"] == 100
+    assert "taking the one before" in said[0]
+    for step in (150, 160):
+        _checkpoints.write(tmp_path, step, tree, {})
+    assert [path.name[11:19] for path in _checkpoints.checkpoints(tmp_path)] == ["00000160", "00000150"]
 
 
 @pytest.mark.parametrize(
@@ -167,6 +194,14 @@ def test_jitter_changes_what_may_not_be_negative_by_a_tenth():
             assert np.all(ratio == 1), name
         else:
             assert 0.06 < np.log(ratio).std() < 0.15, name
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "poisson-gaussian"])
+def test_simpler_noise_is_as_strong_before_it_is_clipped(kind):
+    """At a black level of 0 half of the noise is cut off, of the camera and of what stands for it."""
+    models = [hsnoise.cameras.grasshopper3(black_level_dn=black) for black in (0, 200)]
+    numbers = [{n: value for n, (value, _) in matched(m, kind, 4.0).table().items()} for m in models]
+    assert numbers[0]["read_noise.sigma"] == pytest.approx(numbers[1]["read_noise.sigma"], rel=0.02)
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "poisson-gaussian"])
@@ -275,6 +310,15 @@ def test_an_evaluation_is_written(folder, tmp_path, capsys):
     with pytest.raises(SystemExit):
         evaluate.main([str(weights.with_name("run.json")), "--clips", str(folder)])
     assert "not a file of weights" in capsys.readouterr().err
+
+
+def test_clips_that_were_trained_on_are_not_scored(folder, tmp_path, capsys):
+    train.main(arguments(folder, tmp_path / "run"))
+    net, about = load_network(tmp_path / "run" / train.ENDED)
+    save_network(tmp_path / "other.eqx", net, {**about, "clips": [*about["clips"], *about["held_out"]]})
+    with pytest.raises(SystemExit):
+        evaluate.main([str(tmp_path / "other.eqx"), "--clips", str(folder), "--crop", "8", "--no-rivals"])
+    assert "was trained on them" in capsys.readouterr().err
 
 
 def mono_camera(white_e=(20.0, 20.0)):
