@@ -19,7 +19,7 @@ from hsnoise.statistics import Summary, without_counts
 TITLES = {
     "ml": "Joint maximum likelihood",
     "line": "Line fit",
-    "synthetic": "Maximum likelihood, corrected for added effects by simulated statistics",
+    "synthetic": "Base fit, corrected for added effects by simulated statistics",
 }
 
 

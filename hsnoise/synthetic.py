@@ -39,6 +39,7 @@ OFF_BOUNDS = 0.02  # share of the range between two bounds
 SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
 SHRINKAGE = 0.1
 MARGIN = 1.15
+UNKNOWN = 1e3  # deviation of what the base fit does not know, in sizes
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
@@ -133,7 +134,10 @@ class Problem:
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
         """Variances and directions of the covariance of the base coordinates over their sizes."""
         slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12) * self.sizes
-        return np.linalg.eigh(self.base.covariance / slope[:, None] / slope[None, :])
+        covariance, unknown = self.base.covariance.copy(), ~np.isfinite(np.diagonal(self.base.covariance))
+        covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+        covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
+        return np.linalg.eigh(covariance / slope[:, None] / slope[None, :])
 
     @cached_property
     def whiten(self) -> np.ndarray:
@@ -257,6 +261,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     turn = np.zeros((len(y), len(y)))
     turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
     turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
+    of_base = "" if base.method == "ml" else f"; of the fit that it starts from: {base.outcome}"
     met = "simulated statistics met" if last_step < LONG_STEP else "NOT CONVERGED: simulated statistics not met"
     return replace(
         base,
@@ -265,10 +270,10 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         names=(*base.names, *(knob.label for knob in problem.knobs)),
         covariance=_not_surer_than(base.covariance, turn @ covariance @ turn.T),
         method="synthetic",
-        outcome=f"{met}: the last step was {last_step:.1g} standard errors long",
+        outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
         iterations=iterations,
         log_likelihood=float("nan"),
-        notes=_notes(problem, covariance),
+        notes=(*(base.notes if base.method == "line" else ()), *_notes(problem, covariance)),
     )
 
 
@@ -290,11 +295,14 @@ def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
     The effects' own errors are widened by as much.
     """
-    n = len(base)
-    growth = np.sqrt(np.maximum(np.diagonal(base) / np.maximum(np.diagonal(covariance)[:n], 1e-300), 1.0))
-    known = growth[growth < MOST_GROWTH]
-    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(known) if known.size else 1.0)])
-    return covariance * factor[:, None] * factor[None, :]
+    n, known = len(base), np.isfinite(np.diagonal(base))
+    before = np.where(known, np.diagonal(base), 0.0)
+    growth = np.sqrt(np.maximum(before / np.maximum(np.diagonal(covariance)[:n], 1e-300), 1.0))
+    few = growth[growth < MOST_GROWTH]
+    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(few) if few.size else 1.0)])
+    widened = covariance * factor[:, None] * factor[None, :]
+    widened[np.flatnonzero(~known), np.flatnonzero(~known)] = np.inf  # still not determined
+    return widened
 
 
 def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:

@@ -166,6 +166,11 @@ def test_verdicts(found, said, good):
     assert _context.is_good(found) is good
 
 
+def test_a_model_of_another_capture_is_no_good_news():
+    """Base parameters that are off are projected out by a diagnosis; the error of the comparison tells."""
+    assert "does not fit" in _context.verdict(diagnosis("nothing missing", ()), comparison(300.0))
+
+
 def test_bars_are_ordered_and_share_a_scale():
     bars = _context.bars(comparison(40.0))
     positions = [float(one["width"].rstrip("%")) for one in bars["groups"]]

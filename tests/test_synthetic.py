@@ -9,7 +9,7 @@ import pytest
 import hsnoise
 from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
-from hsnoise.synthetic import Problem, _as_scattered, fit_synthetic, knobs
+from hsnoise.synthetic import Problem, _as_scattered, _not_surer_than, fit_synthetic, knobs
 
 STATISTICS, NUMBERS = 60, 3
 SLOPES = np.random.default_rng(0).standard_normal((STATISTICS, NUMBERS))
@@ -92,3 +92,9 @@ def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, lab
     start, ahead = knob.inverse(x), knob.inverse(x + 0.2)
     assert 0.002 < (ahead - start) / (start or 1.0) < 0.3
     assert knob.slope(x) == pytest.approx((knob.inverse(x + 1e-6) - knob.inverse(x - 1e-6)) / 2e-6, rel=1e-3)
+
+
+def test_what_a_line_fit_does_not_know_stays_unknown():
+    covariance = _not_surer_than(np.diag([4.0, np.inf]), np.eye(3))
+    np.testing.assert_allclose(np.diagonal(covariance), [4.0, np.inf, 4.0])
+    assert not np.isnan(covariance).any()

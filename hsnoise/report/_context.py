@@ -37,7 +37,7 @@ def context(
     return {
         "title": TITLES[type(found)],
         "verdict": verdict(found, comparison),
-        "good": is_good(found),
+        "good": is_good(found) and (comparison is None or comparison.error < CLEAR),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
         "notes": fit.notes if isinstance(fit, FitResult) else (),
@@ -63,6 +63,8 @@ def verdict(found: Comparison | Diagnosis | Story, comparison: Comparison | None
         worst = max(found.groups, key=found.groups.__getitem__)
         return f"The model fails these frames, most of all in {worst}: {yardstick}."
     after = f"; {yardstick}" if error else ""
+    if found.verdict == "nothing missing" and comparison is not None and comparison.error >= CLEAR:
+        return f"No effect stands out, but the model does not fit these frames ({error}): is it a fit of this capture?"
     if found.verdict == "nothing missing":
         return f"Nothing significant is missing{f' ({error})' if error else ''}."
     if found.verdict == "unexplained":
