@@ -298,7 +298,7 @@ def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     n, known = len(base), np.isfinite(np.diagonal(base))
     before = np.where(known, np.diagonal(base), 0.0)
     growth = np.sqrt(np.maximum(before / np.maximum(np.diagonal(covariance)[:n], 1e-300), 1.0))
-    few = growth[growth < MOST_GROWTH]
+    few = growth[known & (growth < MOST_GROWTH)]
     factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(few) if few.size else 1.0)])
     widened = covariance * factor[:, None] * factor[None, :]
     widened[np.flatnonzero(~known), np.flatnonzero(~known)] = np.inf  # still not determined
