@@ -150,6 +150,7 @@ def test_one_short_exposure_keeps_honest_errors(seed, black_level):
     assert_gain_not_determined(hsnoise.cameras.canon_5d3(black_level_dn=64), 0.0005, black_level, seed)
 
 
+@pytest.mark.slow
 def test_bias_frames_alone_do_not_determine_gain_or_dark_current():
     model = hsnoise.cameras.grasshopper3(black_level_dn=64)
     result = hsnoise.fit(capture(model, exposure_s=(0.0,)))
@@ -183,6 +184,7 @@ def test_flats_determine_the_gain_of_a_camera_without_dark_current(rng):
     assert any("row_gain.sigma is compatible with zero" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_hot_pixels_are_set_apart_and_told(rng):
     model = hsnoise.cameras.grasshopper3(black_level_dn=64)
     hot = rng.random(SHAPE) < 0.004
@@ -311,7 +313,7 @@ def test_flats_alone_need_a_black_level(rng):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("case", ["a", "b"])
+@pytest.mark.parametrize("case", ["a", pytest.param("b", marks=pytest.mark.slow)])
 def test_cases_of_another_simulator_are_recovered(shared_data, case):
     answers = json.loads((shared_data / "cases" / "answers.json").read_text())[f"case_{case}"]["base"]
     with np.load(shared_data / "cases" / f"case_{case}.npz") as stored:

@@ -158,7 +158,7 @@ def test_groups_blocks_and_empty_places_change_nothing_for_white_rows():
     np.testing.assert_allclose(slope, expected_slope, rtol=1e-6)
 
 
-@pytest.mark.parametrize("exponent", [0.0, 1.0])
+@pytest.mark.parametrize("exponent", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_groups_blocks_and_empty_places_change_nothing_for_coloured_rows(exponent):
     grouped, plain = grouped_and_not()
 
