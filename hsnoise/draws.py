@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import jax
 import numpy as np
@@ -46,7 +45,7 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
     # What depends on the place stays where it is on the sensor.
     window = part.window or ((0, first, rows, columns) if end - first < columns else None)
-    return FrameStack(counts, **{**_like(part), "window": window})
+    return part.with_counts(counts, window)
 
 
 def check_fits(model: NoiseModel, stack: FrameStack) -> None:
@@ -103,7 +102,7 @@ def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
             own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key, window=like.window
         )
         counts.append(np.asarray(drawn))
-    return like.drawn(counts)
+    return like.with_counts(counts, like.window)
 
 
 def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
@@ -127,11 +126,6 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
         coefficients = np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T
         surface[r::step, c::step] = down @ coefficients @ across.T
     return surface
-
-
-def _like(stack: FrameStack) -> dict[str, Any]:
-    keep = ("exposure_s", "white_level", "cfa", "shutter", "kind", "window")
-    return {name: getattr(stack, name) for name in keep}
 
 
 def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:

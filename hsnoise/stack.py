@@ -185,16 +185,17 @@ class FrameStack:
                 tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
             yield from dask.compute(*tasks)
 
-    def drawn(self, counts: Sequence[np.ndarray]) -> FrameStack:
-        """Simulated `counts`, an array an exposure in sensor orientation, taken as this stack was.
+    def with_counts(self, counts: Sequence[np.ndarray], window: Window | None) -> FrameStack:
+        """Other `counts`, an array an exposure in sensor orientation, as if they had been taken as this stack was.
 
         Their values are not checked: what would be a broken file may be a fair draw of a quiet camera.
         """
         unknown = {"black_level": None, "photons_e": None, "temperature_c": None, "iso": None, "row_axis": 0}
         stack = object.__new__(FrameStack)
         for name in self.__dataclass_fields__:
-            value = tuple(counts) if name == "counts" else unknown.get(name, getattr(self, name))
-            object.__setattr__(stack, name, value)
+            object.__setattr__(stack, name, unknown.get(name, getattr(self, name)))
+        object.__setattr__(stack, "counts", tuple(counts))
+        object.__setattr__(stack, "window", window)
         return stack
 
     def check(self) -> None:

@@ -204,8 +204,6 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
 
 def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack) -> FitResult:
     model = steps[-1].fit.params.add(effect)
-    if effect.name in WITH_LIKELIHOOD:
-        return fit(fitted, model=model)
     base = next((step.fit for step in reversed(steps) if step.fit.method != "synthetic"), None)
     if base is None or any(name in WITH_LIKELIHOOD and name not in base.params for name in model.names):
         return fit(fitted, model=model)

@@ -128,16 +128,14 @@ def _pair(score: float, amplitudes, law: Gaussian, both, evidence: Evidence) -> 
 
 def closest(of: Fingerprint, evidence: Evidence, beside: np.ndarray) -> AbstractEffect:
     """The effect with the amplitude and details that describe the capture best, with `beside` shifting it, too."""
-    best: tuple[float, float, int] | None = None
-    for amplitude in GRID:
-        shifts = of.at(float(amplitude))
-        law = law_of(shifts, evidence.null, of_details=False)
-        scores = [float(Gaussian(one + beside, law.covariance).log_density(evidence.z)) for one in shifts]
-        i = int(np.argmax(scores))
-        if best is None or scores[i] > best[0]:
-            best = scores[i], float(amplitude), i
-    assert best is not None  # GRID is not empty
-    return made(of.maker, *best[1:])
+    scored = []
+    for amplitude in map(float, GRID):
+        shifts = of.at(amplitude)
+        covariance = law_of(shifts, evidence.null, of_details=False).covariance
+        densities = [Gaussian(one + beside, covariance).log_density(evidence.z) for one in shifts]
+        scored += [(float(density), amplitude, detail) for detail, density in enumerate(densities)]
+    _, amplitude, detail = max(scored, key=lambda one: one[0])
+    return made(of.maker, amplitude, detail)
 
 
 def _laws_together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
