@@ -80,8 +80,8 @@ def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
         n, rows, columns = clip.frames.shape[:3]
         if n < (frames + 1) // 2 or min(rows, columns) < side:
             raise ValueError(
-                f"clip {clip.name}: {n} frames of {rows} x {columns}; training takes {frames} frames (or half of them,"
-                f" forth and back) of {side} x {side}"
+                f"clip {clip.name}: {n} frames of {rows} x {columns}; expected {frames} frames (or half of them,"
+                f" forth and back) of at least {side} x {side}"
             )
 
 

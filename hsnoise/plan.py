@@ -71,14 +71,19 @@ def _channel_blocks(physics: Physics, c: int, summary: Summary, margin: float):
     scale = np.clip(1 / (float(physics.gain[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
     beta, table, information = (np.asarray(x) for x in _scan(physics, c, without_counts(summary), scale))
     layout, counts = _sort_rows(histograms)
-    low, high = _reach(table, beta, counts)
+    low, high, peak = _reach(table, beta, counts)
     # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
     best = np.where(seen, information, 0).max(1) * histograms.row_pixels.max((1, 2))
     # The prior is part of what the nodes must resolve: its width in u where the rows are densest.
     width = np.minimum(1 / np.sqrt(best + 1e-12), sigma / np.sqrt(scale**2 + 1))[:, None]
     top, bottom = 1 + rows.PRIOR_REACH * sigma, max(1 - rows.PRIOR_REACH * sigma, 0.0)
-    low, high = np.clip(low / margin, bottom, top), np.clip(high * margin, bottom, top)
+    low, high = low / margin, high * margin
+    if summary.shutter == "rolling":
+        # The gains of coloured rows have a mean of 1: where that of the rows' best is another, all are pulled there.
+        pull = 1 - peak.mean(1, keepdims=True)
+        low, high = low + np.minimum(pull, 0), high + np.maximum(pull, 0)
+    low, high = np.clip(low, bottom, top), np.clip(high, bottom, top)
     span = np.arcsinh(high / scale[:, None]) - np.arcsinh(low / scale[:, None])
     wanted = (NODES_PER_SIGMA * span / width).max(0) + 16
     # The group of the darkest rows reaches far down and needs many nodes, the others few.
@@ -126,9 +131,9 @@ def _scan(physics: Physics, c: int, summary: Summary, scale):
     return jax.lax.map(exposure, (at, jnp.asarray(scale)))
 
 
-def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range of beta [exposure, group] within which the most extreme rows of a group keep any likelihood."""
-    low, high = np.ones(counts.shape[:2]), np.ones(counts.shape[:2])
+def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Range of beta within which the most extreme rows of a group keep any likelihood, and its best: [exposure, group]."""
+    low, high, peak = np.ones((3, *counts.shape[:2]))
     index = np.arange(counts.shape[-1])
     for e, curve in enumerate(table):
         for g, group in enumerate(counts[e]):
@@ -145,4 +150,5 @@ def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.
                 alive = np.array([0, len(beta[e]) - 1])
             low[e, g] = beta[e, max(alive[0] - 1, 0)]
             high[e, g] = beta[e, min(alive[-1] + 1, len(beta[e]) - 1)]
-    return low, high
+            peak[e, g] = beta[e, np.argmax(group.sum(0) @ curve.T)]
+    return low, high, peak

@@ -128,7 +128,7 @@ def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
         (["--lux", "0"], "above 0"),
         (["--clips", "nowhere"], "--clips: expected a folder"),
         (["--vgg", "nowhere.pth"], "--vgg: there is no file"),
-        (["--preset", "cpu"], "training takes 12 frames"),
+        (["--preset", "cpu"], "expected 12 frames"),
     ],
 )
 def test_bad_input_is_named(folder, tmp_path, capsys, more, words):

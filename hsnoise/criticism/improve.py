@@ -239,7 +239,8 @@ def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
     for name in before.names:
         (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
         if abs(new - old) > MOVED_SIGMA * max(error, new_error) > 0:
-            moved.append(f"{name} moved from {old:.4g} to {new:.4g} {unit}.")
+            words = f"{name} moved from {old:.4g} to {new:.4g}"
+            moved.append(f"{words}." if unit == "1" else f"{words} {unit}.")
     return tuple(moved)
 
 
