@@ -90,16 +90,18 @@ class Knob:
 
 
 def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
-    """The numbers of the effects called `extra`."""
+    """The numbers of the effects called `extra`, less those that are held."""
     found = []
     for name in extra:
         effect = model[name]
         labels = iter(p.name for p in effect.parameters(model.channels))
         for field, spec in effect.specs().items():
             for place in [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]:
+                label = next(labels)
                 value = abs(float(np.asarray(getattr(effect, field))[place]))
                 size = value if 0 < value < SMALL else 1.0
-                found.append(Knob(next(labels), name, field, place, spec.low, spec.high, size))
+                if not spec.held:
+                    found.append(Knob(label, name, field, place, spec.low, spec.high, size))
     return found
 
 

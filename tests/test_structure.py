@@ -33,7 +33,7 @@ from hsnoise.effects import (
     SharedRowGain,
     TapOffsets,
 )
-from hsnoise.structure import _anova, structure
+from hsnoise.structure import _anova, moving_line, structure
 
 SHAPE, FRAMES, EXPOSURE_S = (96, 128), 6, (0.01, 0.03, 0.1, 0.2)
 CLEAN = 12
@@ -230,6 +230,25 @@ def test_statistic_reacts_to_its_effect(effect, name, sign):
     i = names.index(name)
     assert found.names == names
     assert sign * (found.values[i] - mean[i]) > 5 * spread[i]
+
+
+# At half a cycle a line, the colours of a Bayer sensor see an offset, not a line.
+LINES = [(cfa, *line) for cfa in ("mono", "RGGB") for line in (("row", 0.288), ("column", 0.041), ("column", 0.3333))]
+
+
+@pytest.mark.parametrize(("cfa", "axis", "frequency"), [*LINES, ("mono", "row", 0.5), ("RGGB", "row", 0.48)])
+def test_the_strongest_line_is_found_to_a_part_of_a_cycle(cfa, axis, frequency, rng):
+    capture = noise(rng, (6, 6), (94, 110), cfa, sigma=8.0)
+    n = capture.shape[0 if axis == "row" else 1]
+    phase = rng.uniform(0, 2 * np.pi, (2, 6, 1))
+    if frequency == 0.5:  # a phase in between would be a smaller amplitude
+        phase = np.pi * np.rint(phase / np.pi)
+    wave = 6 * np.cos(2 * np.pi * frequency * np.arange(n) + phase)
+    wave = wave[..., :, None] if axis == "row" else wave[..., None, :]
+    counts = [np.rint(capture.counts[i] + wave[i]).clip(0).astype(np.uint16) for i in range(2)]
+    found = moving_line(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=64.0, cfa=cfa), np.array(64.0))
+    assert found[0] == axis
+    assert abs(found[1] - frequency) < 0.15 / n
 
 
 def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():

@@ -94,6 +94,11 @@ def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, lab
     assert knob.slope(x) == pytest.approx((knob.inverse(x + 1e-6) - knob.inverse(x - 1e-6)) / 2e-6, rel=1e-3)
 
 
+def test_what_an_effect_holds_is_no_knob():
+    model = hsnoise.cameras.grasshopper3().add(fx.PeriodicBanding(1.0, 0.2))
+    assert [k.label for k in knobs(model, ("periodic_banding",))] == ["periodic_banding.amplitude"]
+
+
 def test_what_a_line_fit_does_not_know_stays_unknown():
     covariance = _not_surer_than(np.diag([4.0, np.inf]), np.eye(3))
     np.testing.assert_allclose(np.diagonal(covariance), [4.0, np.inf, 4.0])

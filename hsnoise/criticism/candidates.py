@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise import effects as fx
-from hsnoise.draws import light_of
+from hsnoise.draws import black_level_of, light_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
+from hsnoise.structure import moving_line
 
 LEAST_ELECTRONS = 0.2
 
@@ -24,7 +25,10 @@ Maker = Callable[[float, np.random.Generator], AbstractEffect]
 
 @dataclass(frozen=True)
 class Scale:
-    """What amplitudes are measured by: read noise e-, longest exposure s, dark current e-/s, gain DN/e-, frames."""
+    """What amplitudes are measured by: read noise e-, longest exposure s, dark current e-/s, gain DN/e-, frames.
+
+    line: axis and frequency of the strongest line in the capture.
+    """
 
     read_noise: float
     longest_s: float
@@ -34,6 +38,7 @@ class Scale:
     has_exposure: bool
     exposures_differ: bool  # of the darks
     light: float  # most photoelectrons of a flat, e-
+    line: tuple[str, float]
 
     @staticmethod
     def of(model: NoiseModel, part: FrameStack) -> Scale:
@@ -48,6 +53,7 @@ class Scale:
             has_exposure=longest > 0,
             exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
+            line=moving_line(part, black_level_of(model)),
         )
 
 
@@ -85,9 +91,7 @@ def _read_out(s: Scale) -> dict[str, Maker]:
         "row_fixed_pattern": lambda f, rng: fx.RowFixedPattern(0.2 * f * read),
         "column_fixed_pattern": lambda f, rng: fx.ColumnFixedPattern(0.2 * f * read),
         "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read),
-        "periodic_banding": lambda f, rng: fx.PeriodicBanding(
-            0.3 * f * read, rng.uniform(0.03, 0.45), axis=str(rng.choice(["row", "column"]))
-        ),
+        "periodic_banding": lambda f, rng: fx.PeriodicBanding(0.3 * f * read, s.line[1], axis=s.line[0]),
         "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
         "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * rng.choice([-1, 1]), 0.0),
         "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, taps=int(rng.choice([2, 4, 8]))),

@@ -63,13 +63,14 @@ class Stage(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class ParameterSpec:
-    """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning."""
+    """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning, whether held."""
 
     unit: str
     low: float | None
     high: float | None
     per_channel: bool
     doc: str
+    held: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +95,7 @@ def param(
     per_channel: bool = False,
     default: float | None = None,
     doc: str = "",
+    held: bool = False,
 ) -> Any:
     """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
 
@@ -103,8 +105,9 @@ def param(
         per_channel: one value per colour channel; a scalar given instead holds for all channels.
         default: value unless one is given; None: one must be given.
         doc: its meaning in a few words.
+        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly.
     """
-    spec = ParameterSpec(unit, low, high, per_channel, doc)
+    spec = ParameterSpec(unit, low, high, per_channel, doc, held)
     metadata = {"parameter": spec}
     if default is None:
         return eqx.field(converter=_as_leaf, metadata=metadata)

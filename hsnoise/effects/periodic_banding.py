@@ -19,7 +19,8 @@ class PeriodicBanding(AbstractEffect):
     A clock or a power supply couples into the readout; its frequency keeps no step with the frames. Its variance is
     amplitude^2 / 2.
 
-    In dark frames: bands that run from frame to frame, one sharp line in the spectrum of row (column) means.
+    In dark frames: bands that run from frame to frame, one sharp line in the spectrum of row (column) means. `diagnose`
+    takes the frequency from there; a fit holds it and finds the amplitude.
 
     Attributes:
         axis: "row" for a sinusoid over rows (horizontal bands), "column" for one over columns.
@@ -30,7 +31,7 @@ class PeriodicBanding(AbstractEffect):
     name: ClassVar[str] = "periodic_banding"
     stage: ClassVar[Stage] = Stage.READ
     amplitude: Scalar = param("e-", low=0, doc="amplitude of the sinusoid")
-    frequency: Scalar = param("cycles/pixel", low=0, high=0.5, doc="cycles per row, or column")
+    frequency: Scalar = param("cycles/pixel", low=0, high=0.5, held=True, doc="cycles per row, or column; fits hold it")
     axis: str = eqx.field(static=True, default="row")
 
     def __check_init__(self):

@@ -16,7 +16,7 @@ from hsnoise.structure import _lines, _pixels, _views
 from hsnoise.structure._anova import Exposure, Layout, layout_of, read_exposure
 from hsnoise.structure._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["Structure", "structure"]
+__all__ = ["Structure", "moving_line", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +126,20 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
         where = "row spectrum" if group == "row x frame" else group
         out[where, f"peak of the spectrum, {half}"] = Entry(_lines.peak(mean), 0.15)
     return out
+
+
+def moving_line(stack: FrameStack, black_level_dn: np.ndarray) -> tuple[str, float]:
+    """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each."""
+    layout = layout_of(stack)
+    of = [_lines.periodograms(read_exposure(stack, layout, i, black_level_dn)) for i in range(len(layout.frames))]
+    step = 1 if layout.cfa == "mono" else 2
+    found = []
+    for axis, used in (("row", layout.rows), ("column", layout.columns)):
+        mean = np.mean([one[f"{axis} x frame"] for one in of], 0)
+        height, frequency = _lines.strongest_line(mean, (used.stop - used.start) // step * step)
+        found.append((height, axis, frequency))
+    _, axis, frequency = max(found)
+    return axis, frequency
 
 
 def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -> dict[tuple[str, str], Entry]:
