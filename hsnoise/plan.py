@@ -132,7 +132,7 @@ def _scan(physics: Physics, c: int, summary: Summary, scale):
 
 
 def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Range of beta within which the most extreme rows of a group keep any likelihood, and its best: [exposure, group]."""
+    """Range of beta where the most extreme rows of a group keep any likelihood, and its best: [exposure, group]."""
     low, high, peak = np.ones((3, *counts.shape[:2]))
     index = np.arange(counts.shape[-1])
     for e, curve in enumerate(table):
