@@ -44,7 +44,7 @@ MODEST = {
     "dark_signal_nonuniformity": 1.5,
     "hot_pixels": 0.004,  # of the pixels
     "amplifier_glow": 60.0,  # e-/s in the corner
-    "dark_current_drift": 0.25,  # relative, over the frames of an exposure
+    "dark_current_drift": 0.25,  # relative, from the first frame of an exposure to the last
     "random_telegraph_noise": 0.03,  # of the pixels, 12 e-
     "heavy_tailed_read_noise": 5.0,  # degrees of freedom
     "read_noise_nonuniformity": 0.35,
@@ -178,7 +178,7 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     whole = (frames, *shape)
     rate = camera.dark + hidden.get("rate", 0.0)
     if drift := sizes.get("dark_current_drift"):
-        rate = rate * (1 + drift * (np.arange(frames)[:, None, None] / max(frames - 1, 1) - 0.5))
+        rate = rate * (1 + drift * np.arange(frames)[:, None, None] / max(frames - 1, 1))
     x = rng.poisson(np.broadcast_to(rate * t, whole)).astype(float)
     if hits := sizes.get("cosmic_rays"):
         x += (rng.random(whole) < hits * 1e-6) * rng.exponential(120.0, whole)

@@ -230,6 +230,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     """`base` with the effects of `model` that it lacks, and base parameters corrected for them.
 
     base: fit of the same capture without those effects. model: its values are where the search for the effects starts.
+    Raises RuntimeError where the model's draws have no statistics.
     """
     part, tick = part_of(stack), progress or (lambda: None)
     extra = tuple(name for name in model.names if name not in base.params)
@@ -249,6 +250,9 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
             covariance, gain = np.linalg.inv(information), slopes.T @ weight
             sure = last_step < SURE_STEP or iteration == MOST_SLOPES
         step = covariance @ (gain @ ((measured - drawn.mean(0)) / scale) - prior * (y - problem.start))
+        if not np.isfinite(step).all():
+            at = [f"{k.label} {k.inverse(x):.3g}" for k, x in zip(problem.knobs, y[len(problem.centre) :], strict=True)]
+            raise RuntimeError(f"statistics of draws are not finite at {', '.join(at)}; fit from another start")
         y = y + step * problem.share_of(step)
         last_step = float(np.abs(step / np.sqrt(np.diagonal(covariance))).max())
         if sure and last_step < SHORT_STEP:

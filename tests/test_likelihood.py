@@ -164,6 +164,16 @@ def test_rules_hold_away_from_where_they_were_made():
         np.testing.assert_allclose(float(ours), float(own), rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize(("rate", "gain"), [(1.7, 1.0), (0.5, 1.0), (1.0, 0.65), (1.3, 1.3)])
+def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, gain):
+    """Coloured rows have no common offset that could take up a wrong mean."""
+    model = camera(shutter="rolling", black_level_dn=10.0)
+    summary = hsnoise.summarise(capture(model, shape=(64, 96), frames=4))
+    wrong = model.with_value("dark_current", "rate", rate * model["dark_current"].rate)
+    wrong = wrong.with_value("gain", "value", gain * model["gain"].value)
+    assert float(hsnoise.log_likelihood(wrong, summary)) < float(hsnoise.log_likelihood(model, summary)) - 100
+
+
 def test_rows_of_a_model_without_row_gain_need_no_integral():
     model = camera(black_level_dn=20.0).remove("row_gain")
     stack = capture(model, shape=(16, 32))
