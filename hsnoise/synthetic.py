@@ -31,7 +31,7 @@ COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
 MOST_SLOPES, MOST_ITERATIONS = 4, 16  # derivatives cost four times what means do, and change little near the end
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
-STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of a base parameter, in standard errors; of an effect's, in its logarithm
+STEP_SIGMA, STEP_LOG = 2.0, 0.2  # for derivatives: standard errors, and for effects at most this in the logarithm
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
@@ -242,12 +242,14 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     y = problem.start
     scale, weight = _weights(problem, y, tick)
     prior, last_step, sure = problem.prior, np.inf, False
+    by = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
     for iteration in range(1, MOST_ITERATIONS + 1):
         drawn = _draws(problem, y, tick)
         if not sure:
-            slopes = _slopes(problem, y, drawn, tick) / scale[:, None]
+            slopes = _slopes(problem, y, by, drawn, tick) / scale[:, None]
             information = slopes.T @ weight @ slopes + np.diag(prior)
             covariance, gain = np.linalg.inv(information), slopes.T @ weight
+            by = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance)))
             sure = last_step < SURE_STEP or iteration == MOST_SLOPES
         step = covariance @ (gain @ ((measured - drawn.mean(0)) / scale) - prior * (y - problem.start))
         if not np.isfinite(step).all():
@@ -345,9 +347,8 @@ def _draws(problem: Problem, y: np.ndarray, tick) -> np.ndarray:
     return np.stack([v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)])
 
 
-def _slopes(problem: Problem, y: np.ndarray, drawn: np.ndarray, tick) -> np.ndarray:
-    """Derivatives of the statistics at y [statistic, number], by random numbers common with `drawn`."""
-    steps = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
+def _slopes(problem: Problem, y: np.ndarray, steps: np.ndarray, drawn: np.ndarray, tick) -> np.ndarray:
+    """Derivatives of the statistics at y [statistic, number] over `steps`, by random numbers common with `drawn`."""
 
     def difference(task: tuple[int, int]) -> np.ndarray:
         which, number = task
