@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,29 @@ def span(name: str, value: Any, size: int) -> slice:
     if step not in (None, 1) or not 0 <= start < stop <= size:
         raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
     return slice(int(start), int(stop))
+
+
+def check_no_copies(prints: Iterable[bytes], exposure_s: float) -> None:
+    """Raise ValueError if two frames of an exposure are the same, told by what stands for each in `prints`."""
+    seen: dict[bytes, int] = {}
+    for number, one in enumerate(prints):
+        first = seen.setdefault(one, number)
+        if first != number:
+            raise ValueError(
+                f"counts: frames {first} and {number} of the {exposure_s:g} s exposure are identical; a copy tells"
+                " nothing of the noise, so give each frame once"
+            )
+
+
+def whole_number(name: str, value: Any, least: int | None = None) -> int:
+    """`value` as an int. Raises TypeError for what is no whole number, ValueError below `least`."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: expected a whole number, got {value!r}") from None
+    if least is not None and number < least:
+        raise ValueError(f"{name}: expected at least {least}, got {value}")
+    return number
 
 
 def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:

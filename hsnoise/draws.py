@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 
 import jax
 import numpy as np
 
+from hsnoise._arguments import check_no_copies
 from hsnoise._keys import named_key
 from hsnoise._types import cfa_tile
 from hsnoise.effects import Stage
@@ -15,6 +17,7 @@ from hsnoise.stack import FrameStack
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+SMALLEST = 32  # rows and columns
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
 FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
@@ -28,8 +31,12 @@ def darks_of(stack: FrameStack) -> FrameStack:
 def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> FrameStack:
     """The exposures of a stack, in memory, cut to what can be drawn many times.
 
-    Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without darks.
+    Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
+    darks, for frames that are copies, and for frames too small to tell rows from pixels.
     """
+    if min(stack.shape) < SMALLEST:
+        rows, columns = stack.shape
+        raise ValueError(f"stack: expected frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}")
     if "dark" not in stack.kind:
         raise ValueError("stack: expected dark frames, got flats only")
     chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
@@ -43,6 +50,8 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     end = min(first + kept, columns)
     part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
     counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
+    for frames_of, exposure_s in zip(counts, part.exposure_s, strict=True):
+        check_no_copies((hashlib.blake2b(frame).digest() for frame in frames_of), exposure_s)
     # What depends on the place stays where it is on the sensor.
     window = part.window or ((0, first, rows, columns) if end - first < columns else None)
     return part.with_counts(counts, window)

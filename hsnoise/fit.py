@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._arguments import check_no_copies
 from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
@@ -39,7 +40,8 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
             not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
             together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "auto" is
-            "ml", and if that does not converge, "line", which the result then says.
+            "ml", and if that does not converge, "line", which the result then says. With effects beyond the paper's
+            it is that of the fit which the simulated statistics start from.
         progress: called with no argument after each frame that has been read.
 
     Returns:
@@ -121,18 +123,10 @@ def _summary_of(stack, progress) -> Summary:
 
 
 def _check_copies(summary: Summary) -> None:
-    """Raise ValueError if two frames of an exposure are the same: copies would pass for independent measurements."""
     for e, n in enumerate(summary.n_frames):
         sums = [(h.row_sum[e, :n], h.row_sum_of_squares[e, :n]) for h in summary.histograms]
         frames = np.concatenate([x for pair in sums for x in pair], axis=1)
-        seen: dict[bytes, int] = {}
-        for number, frame in enumerate(frames):
-            first = seen.setdefault(frame.tobytes(), number)
-            if first != number:
-                raise ValueError(
-                    f"counts: frames {first} and {number} of the {summary.exposure_s[e]:g} s exposure are identical;"
-                    " a copy tells nothing of the noise, so give each frame once"
-                )
+        check_no_copies((frame.tobytes() for frame in frames), summary.exposure_s[e])
 
 
 def _check_model(model: NoiseModel) -> bool:

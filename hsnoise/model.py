@@ -317,9 +317,17 @@ def _signals(key, light, shape, effects, capture):
         capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
     signal = light
     for effect in effects:
-        drawn = _sample_one(key, signal, shape, effect, capture)
+        try:
+            drawn = _sample_one(key, signal, shape, effect, capture)
+        except Exception as error:
+            error.add_note(f"in the sample of the effect {effect.name}")
+            raise
+        if drawn is None:
+            raise ValueError(f"{effect.name}: its sample returned None, expected the signal; is a return missing?")
         if np.shape(drawn) != shape:
             raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
+        if jnp.iscomplexobj(drawn):
+            raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
         signal = drawn
         yield effect, signal
 

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._arguments import whole_number
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
@@ -76,8 +77,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     Raises:
         TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
     """
-    if draws < 8:
-        raise ValueError(f"draws: expected at least 8, got {draws}")
+    draws, seed = whole_number("draws", draws, 8), whole_number("seed", seed)
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
     part = part_of(stack)

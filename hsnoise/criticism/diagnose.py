@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._arguments import whole_number
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
@@ -124,14 +125,13 @@ def diagnose(
             returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
     tick = progress or (lambda: None)
-    if draws < MANY_DETAILS:
-        raise ValueError(f"draws: expected at least {MANY_DETAILS}, got {draws}")
+    draws, seed = whole_number("draws", draws, MANY_DETAILS), whole_number("seed", seed)
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
         raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
     check_fits(model, stack)
-    own = _own(candidates, model)
+    own = {effect.name: given(effect) for effect in not_in(model, check_candidates(candidates))}
     part = part_of(stack)
     check_effects(model, part)
     for maker in own.values():
@@ -213,23 +213,26 @@ def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evi
 
 
 def check_candidates(candidates: Any) -> tuple[AbstractEffect, ...]:
-    """The candidates of a user. Raises TypeError unless they are effects."""
+    """The candidates of a user. Raises TypeError unless they are effects, ValueError for two of one name."""
     if isinstance(candidates, AbstractEffect):
         raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
     candidates = tuple(candidates)
     for effect in candidates:
         if not isinstance(effect, AbstractEffect):
             raise TypeError(f"candidates: expected effects (instances of AbstractEffect), got {effect!r}")
+    names = [effect.name for effect in candidates]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"candidates: {', '.join(sorted(twice))} given more than once")
     return candidates
 
 
-def _own(candidates: Any, model) -> dict[str, Maker]:
-    makers = {}
-    for effect in check_candidates(candidates):
+def not_in(model, candidates: tuple[AbstractEffect, ...]) -> tuple[AbstractEffect, ...]:
+    """The candidates. Raises ValueError for one that the model has."""
+    for effect in candidates:
         if effect.name in model:
             raise ValueError(f"candidates: {effect.name} is in the model already")
-        makers[effect.name] = given(effect)
-    return makers
+    return candidates
 
 
 def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, laws: dict[str, Gaussian]) -> Diagnosis:

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise.criticism.compare import Comparison, compare
-from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose
+from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
-from hsnoise.draws import darks_of
-from hsnoise.effects import AbstractEffect
+from hsnoise.draws import check_effects, check_fits, darks_of
+from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import WITH_LIKELIHOOD, fit
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
@@ -90,7 +90,8 @@ class Story:
         for i, step in enumerate(self.steps):
             worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
             held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
-            table.add_row(str(i), step.added or "the paper's model", f"{step.comparison.error:.2f}", held_out, worst)
+            name = step.added or _start_of(step.fit.params)
+            table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
         console.print(table)
         for i, step in enumerate(self.steps):
             if step.added:
@@ -128,7 +129,8 @@ def improve(
     say = progress or (lambda sentence: None)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
-    say("Fitting the paper's model")
+    _check_start(model, candidates, fitted)
+    say("Fitting the first model")
     result = fit(fitted, model=model)
     steps: list[Step] = [_step(result, fitted, held_out, None, None, seed, say)]
     while True:
@@ -155,6 +157,23 @@ def improve(
                 break
         else:
             return Story(tuple(steps), _left_out([candidate.name for candidate in nearest], found, last.comparison))
+
+
+def _start_of(model: NoiseModel) -> str:
+    """A model in words: effects beyond the paper's by their names."""
+    beyond = [name for name in model.names if name not in WITH_LIKELIHOOD]
+    return " + ".join(["the paper's model", *beyond])
+
+
+def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
+    """Raise ValueError or TypeError for a model or candidates that cannot be drawn."""
+    if not candidates:
+        return
+    typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
+    base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
+    check_fits(base, stack)
+    for effect in not_in(base, candidates):
+        check_effects(base.add(effect), stack)
 
 
 def _is_better(step: Step, before: Step) -> bool:

@@ -38,6 +38,7 @@ class Structure:
 FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
 def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     """The statistics of the exposures of a stack, darks and flats apart.
 

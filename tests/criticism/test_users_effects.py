@@ -31,7 +31,8 @@ class Mine(hsnoise.AbstractEffect):
 FAULTS = {
     "shape": (lambda signal: signal[:, 1:], r"my_effect: .* returned shape \(\d+, 31, 48\), expected \(\d+, 32, 48\)"),
     "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
-    "nothing": (lambda signal: None, r"my_effect: .* returned shape \(\)"),
+    "nothing": (lambda signal: None, "my_effect: .* returned None, .* is a return missing"),
+    "complex": (lambda signal: signal + 1j, "my_effect: .* complex numbers"),
     "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity for .* of the pixels"),
     "infinity": (lambda signal: signal.at[:, 3].divide(0.0), "my_effect: .* NaN or infinity"),
     "unit": (lambda signal: signal + 1e9, r"my_effect: .* signal of 1e\+09 e- .* units that it declares"),
@@ -40,6 +41,7 @@ CALLS = {
     "compare": lambda effect: hsnoise.compare(CAMERA.add(effect), COUNTS, **CAPTURE),
     "diagnose": lambda effect: hsnoise.diagnose(CAMERA, COUNTS, candidates=[effect], **CAPTURE),
     "fit": lambda effect: hsnoise.fit(COUNTS, model=CAMERA.add(effect), **CAPTURE),
+    "improve": lambda effect: hsnoise.improve(COUNTS, candidates=[effect], **CAPTURE),
 }
 
 
@@ -54,6 +56,40 @@ def test_wrong_effect_is_named(call, fault):
 def test_sample_names_effect_of_wrong_shape():
     with pytest.raises(ValueError, match="my_effect: .* returned shape"):
         hsnoise.sample_dark(jax.random.key(1), 2, (32, 48), CAMERA.add(Mine(FAULTS["shape"][0])))
+
+
+def test_fault_in_the_code_of_an_effect_is_told_with_its_name():
+    def fail(signal):
+        raise KeyError("table")
+
+    with pytest.raises(KeyError) as raised:
+        CALLS["diagnose"](Mine(fail))
+    assert "in the sample of the effect my_effect" in raised.value.__notes__
+
+
+def test_candidates_of_one_name_or_in_the_model_are_refused():
+    effect = Mine(lambda signal: signal + 1)
+    for call in (hsnoise.diagnose, lambda model, *rest, **keywords: hsnoise.improve(*rest, model=model, **keywords)):
+        with pytest.raises(ValueError, match="candidates: my_effect given more than once"):
+            call(CAMERA, COUNTS, candidates=[effect, effect], **CAPTURE)
+        with pytest.raises(ValueError, match="candidates: my_effect is in the model already"):
+            call(CAMERA.add(effect), COUNTS, candidates=[effect], **CAPTURE)
+
+
+@pytest.mark.parametrize("call", [hsnoise.compare, hsnoise.diagnose])
+def test_arguments_are_named(call):
+    with pytest.raises(TypeError, match="draws: expected a whole number, got 20.5"):
+        call(CAMERA, COUNTS, draws=20.5, **CAPTURE)
+    with pytest.raises(ValueError, match="draws: expected at least"):
+        call(CAMERA, COUNTS, draws=3, **CAPTURE)
+    with pytest.raises(TypeError, match="seed: expected a whole number, got 'x'"):
+        call(CAMERA, COUNTS, seed="x", **CAPTURE)
+    with pytest.raises(TypeError, match="stack: expected a FrameStack or an array of counts, got NoiseModel"):
+        call(COUNTS, CAMERA)
+    with pytest.raises(ValueError, match="frames 0 and 1 of the 0.03 s exposure are identical"):
+        call(CAMERA, np.repeat(COUNTS[:, :1], 4, axis=1), **CAPTURE)
+    with pytest.raises(ValueError, match="stack: expected frames of at least 32 x 32 pixels, got 30 x 48"):
+        call(CAMERA, COUNTS[:, :, :30], **CAPTURE)
 
 
 @pytest.mark.parametrize("candidate", [Mine, "row_noise", 3])
