@@ -54,7 +54,7 @@ MODEST = {
     "image_lag": 0.04,
     "odd_even_pattern": 0.8,  # e-
     "tap_offsets": 0.8,  # e-
-    "missing_codes": 1.6,  # digital gain
+    "missing_codes": 0.6,  # digital gain less 1
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
     "shared_row_gain": 0.12,
     "black_clamp": 0.7,  # of the dark level
@@ -236,6 +236,6 @@ def _digital(camera: Camera, sizes, x: np.ndarray, t: float, rng) -> np.ndarray:
         clamped = sizes.get("black_clamp", 0.0) * camera.gain[c] * camera.dark * t
         y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x - clamped, y)
     counts = np.clip(np.rint(y + camera.black), 0, 65535)
-    if step := sizes.get("missing_codes"):
-        counts = np.clip(np.rint(np.rint(counts / step) * step), 0, 65535)
+    if more := sizes.get("missing_codes"):
+        counts = np.clip(np.rint(np.rint(counts / (1 + more)) * (1 + more)), 0, 65535)
     return counts.astype(np.uint16)

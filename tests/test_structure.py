@@ -246,9 +246,27 @@ def test_the_strongest_line_is_found_to_a_part_of_a_cycle(cfa, axis, frequency, 
     wave = 6 * np.cos(2 * np.pi * frequency * np.arange(n) + phase)
     wave = wave[..., :, None] if axis == "row" else wave[..., None, :]
     counts = [np.rint(capture.counts[i] + wave[i]).clip(0).astype(np.uint16) for i in range(2)]
-    found = moving_line(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=64.0, cfa=cfa), np.array(64.0))
+    draws = [noise(rng, (6, 6), (94, 110), cfa, sigma=8.0) for _ in range(6)]
+    found = moving_line(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=64.0, cfa=cfa), draws, np.array(64.0))
     assert found[0] == axis
     assert abs(found[1] - frequency) < 0.15 / n
+
+
+def test_a_weak_line_is_found_beside_the_alternation_of_colours():
+    """Rows of a Bayer sensor whose colours have 1/f gains of their own: their spectrum rises to half a cycle."""
+    model, black, times = CAMERAS["canon_5d3"][0], np.zeros(3), (0.02, 0.1)
+
+    def darks(of, seed):
+        keys = jax.random.split(jax.random.key(seed), 2)
+        counts = [
+            np.asarray(hsnoise.sample_dark(k, 8, (160, 128), of, exposure_s=t)) for k, t in zip(keys, (0.02, 0.1))
+        ]
+        return hsnoise.FrameStack(counts, times, black_level=0.0, cfa="RGGB")
+
+    draws = [darks(model, seed) for seed in range(6)]
+    for seed, frequency in ((10, 0.113), (11, 0.241), (12, 0.377)):
+        axis, found = moving_line(darks(model.add(PeriodicBanding(0.5, frequency)), seed), draws, black)
+        assert (axis, abs(found - frequency) < 0.3 / 160) == ("row", True)
 
 
 def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():

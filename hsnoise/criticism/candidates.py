@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise import effects as fx
-from hsnoise.draws import black_level_of, light_of
+from hsnoise.draws import black_level_of, draw_capture, light_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 from hsnoise.structure import moving_line
 
 LEAST_ELECTRONS = 0.2
+LINE_SEEDS = range(7000, 7006)  # of draws without lines of their own
 
 Maker = Callable[[float, np.random.Generator], AbstractEffect]
 
@@ -53,7 +54,7 @@ class Scale:
             has_exposure=longest > 0,
             exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
-            line=moving_line(part, black_level_of(model)),
+            line=moving_line(part, [draw_capture(s, model, part) for s in LINE_SEEDS], black_level_of(model)),
         )
 
 

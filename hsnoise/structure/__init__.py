@@ -7,6 +7,7 @@ the camera. What decides between effects is mostly correlation: between colours,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,15 +130,24 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
     return out
 
 
-def moving_line(stack: FrameStack, black_level_dn: np.ndarray) -> tuple[str, float]:
-    """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each."""
+def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: np.ndarray) -> tuple[str, float]:
+    """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each.
+
+    Strong is what exceeds the spectra of a model's `draws`: rows of a Bayer pattern with 1/f gains have a peak at
+    half a cycle, as colours take turns.
+    """
     layout = layout_of(stack)
-    of = [_lines.periodograms(read_exposure(stack, layout, i, black_level_dn)) for i in range(len(layout.frames))]
+
+    def spectra(capture: FrameStack, axis: str) -> np.ndarray:
+        read = [read_exposure(capture, layout, i, black_level_dn) for i in range(len(layout.frames))]
+        return np.stack([_lines.periodograms(x)[f"{axis} x frame"] for x in read])
+
     step = 1 if layout.cfa == "mono" else 2
     found = []
     for axis, used in (("row", layout.rows), ("column", layout.columns)):
-        mean = np.mean([one[f"{axis} x frame"] for one in of], 0)
-        height, frequency = _lines.strongest_line(mean, (used.stop - used.start) // step * step)
+        expected = np.mean([spectra(drawn, axis) for drawn in draws], 0)
+        excess = (spectra(stack, axis) / expected).mean(0)
+        height, frequency = _lines.strongest_line(excess, (used.stop - used.start) // step * step)
         found.append((height, axis, frequency))
     _, axis, frequency = max(found)
     return axis, frequency

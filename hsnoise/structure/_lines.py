@@ -176,20 +176,17 @@ def _whitened(series: np.ndarray) -> np.ndarray:
 
 def peak(periodogram: np.ndarray) -> float:
     """Log of the largest value over its surroundings (a running median), which a 1/f rise does not move."""
-    return float(log_ratio(np.max(_above_surroundings(periodogram)), 1.0))
+    width = min(31, len(periodogram) // 4 * 2 + 1)
+    return float(
+        log_ratio(np.max(periodogram / (scipy.ndimage.median_filter(periodogram, width, mode="reflect") + 1e-12)), 1.0)
+    )
 
 
-def strongest_line(periodogram: np.ndarray, n: int) -> tuple[float, float]:
-    """Height over its surroundings of the strongest line of n sensor rows (columns), and its frequency, cycles each."""
-    height = _above_surroundings(periodogram)
+def strongest_line(height: np.ndarray, n: int) -> tuple[float, float]:
+    """The highest of a periodogram about 1 of n sensor rows (columns), and its frequency, cycles each."""
     i = int(np.argmax(height))
     around = np.sqrt(np.maximum(np.pad(height, 1, constant_values=1.0)[i : i + 3] - 1, 0))
     # A line between two frequencies of the transform has amplitudes there as its distances from them.
     left, right = around[[0, 2]] / max(around[1] + max(around[0], around[2]), 1e-12)
     offset = right if right > left else -left
     return float(height[i]), float(min((i + 1 + WHITENED_FROM + offset) / n, 0.5))
-
-
-def _above_surroundings(periodogram: np.ndarray) -> np.ndarray:
-    width = min(31, len(periodogram) // 4 * 2 + 1)
-    return periodogram / (scipy.ndimage.median_filter(periodogram, width, mode="reflect") + 1e-12)
