@@ -259,7 +259,8 @@ def test_a_weak_line_is_found_beside_the_alternation_of_colours():
     def darks(of, seed):
         keys = jax.random.split(jax.random.key(seed), 2)
         counts = [
-            np.asarray(hsnoise.sample_dark(k, 8, (160, 128), of, exposure_s=t)) for k, t in zip(keys, (0.02, 0.1))
+            np.asarray(hsnoise.sample_dark(k, 8, (160, 128), of, exposure_s=t))
+            for k, t in zip(keys, times, strict=True)
         ]
         return hsnoise.FrameStack(counts, times, black_level=0.0, cfa="RGGB")
 
