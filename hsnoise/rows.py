@@ -206,8 +206,8 @@ def _consistent(rows: Curves, spectrum):
 
     def iterate(rows: Curves, start, tolerance: float):
         def step(state):
-            count, _, _, cavity = state
-            return count + 1, *_step(rows, spectrum, *cavity, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
+            count, _, _, (mean, variance) = state
+            return count + 1, *_step(rows, spectrum, mean, variance, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
 
         state = (0, jnp.full_like(start[0][1], jnp.inf), *start)
         return jax.lax.while_loop(lambda s: (s[0] < ITERATIONS) & (s[1].max() > tolerance), step, state)[1:]

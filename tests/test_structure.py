@@ -258,10 +258,8 @@ def test_a_weak_line_is_found_beside_the_alternation_of_colours():
 
     def darks(of, seed):
         keys = jax.random.split(jax.random.key(seed), 2)
-        counts = [
-            np.asarray(hsnoise.sample_dark(k, 8, (160, 128), of, exposure_s=t))
-            for k, t in zip(keys, times, strict=True)
-        ]
+        drawn = [hsnoise.sample_dark(k, 8, (160, 128), of, exposure_s=t) for k, t in zip(keys, times, strict=True)]
+        counts = [np.asarray(frames) for frames in drawn]
         return hsnoise.FrameStack(counts, times, black_level=0.0, cfa="RGGB")
 
     draws = [darks(model, seed) for seed in range(6)]
