@@ -37,7 +37,7 @@ AMPLITUDES, DETAILS, MOST_LIKELY = (0.35, 1.0, 2.5), 4, 10  # and those that are
 MOST_PAIRS = 3  # that are refined, two effects at once
 NEAR = 0.8  # share of the best score that makes a candidate a leader
 MANY_DETAILS = 16  # of which the leaders' best are taken
-AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 6  # amplitudes, relative, at which the leaders are drawn again
+AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 10  # amplitudes, relative, at which the leaders are drawn again
 EVIDENCE = 5.0  # log-likelihood ratio from which an effect is there: 3 of 14 clean captures reached 2.3 to 2.6
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
@@ -194,7 +194,8 @@ def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judg
     makers = {one.of.name: given(*refined([one.candidate(evidence).effect], bench, evidence)) for one in varied}
     prints = bench.fingerprints({name: (maker, AROUND) for name, maker in makers.items()}, CLOSE_DETAILS)
     again = [judge(of, evidence, CLOSE) for of in prints]
-    better = [max(pair, key=lambda one: one.score) for pair in zip(leaders, again, strict=True)]
+    # Not against the leaders as they were: of few draws, rare counts seem to scatter less than they do.
+    better = [max(pair, key=lambda one: one.score) for pair in zip(varied, again, strict=True)]
     return _best_first([*better, *judged[len(leaders) :]])
 
 
