@@ -33,7 +33,7 @@ from hsnoise.effects import (
     SharedRowGain,
     TapOffsets,
 )
-from hsnoise.structure import _anova, moving_line, structure
+from hsnoise.structure import _anova, code_step, moving_line, structure
 
 SHAPE, FRAMES, EXPOSURE_S = (96, 128), 6, (0.01, 0.03, 0.1, 0.2)
 CLEAN = 12
@@ -266,6 +266,17 @@ def test_a_weak_line_is_found_beside_the_alternation_of_colours():
     for seed, frequency in ((10, 0.113), (11, 0.241), (12, 0.377)):
         axis, found = moving_line(darks(model.add(PeriodicBanding(0.5, frequency)), seed), draws, black)
         assert (axis, abs(found - frequency) < 0.3 / 160) == ("row", True)
+
+
+@pytest.mark.parametrize("step", [1.1, 1.3, 1.6, 2.0, 2.75])
+@pytest.mark.parametrize("black", [0.0, 512.0])
+def test_the_distance_of_codes_is_found(step, black, rng):
+    whole = noise(rng, (4, 4), (64, 64), mean=black + 40.0, sigma=12.0, black=black)
+    counts = [np.rint(np.rint(c.astype(float) / step) * step).astype(np.uint16) for c in whole.counts]
+    found = code_step(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=black, cfa="mono"))
+    assert found is not None
+    assert abs(found - step) < 1 / (black + 60)
+    assert code_step(whole) is None
 
 
 def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():

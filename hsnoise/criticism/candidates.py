@@ -16,7 +16,7 @@ from hsnoise.draws import black_level_of, draw_capture, light_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
-from hsnoise.structure import moving_line
+from hsnoise.structure import code_step, moving_line
 
 LEAST_ELECTRONS = 0.2
 LINE_SEEDS = range(7000, 7006)  # of draws without lines of their own
@@ -28,7 +28,7 @@ Maker = Callable[[float, np.random.Generator], AbstractEffect]
 class Scale:
     """What amplitudes are measured by: read noise e-, longest exposure s, dark current e-/s, gain DN/e-, frames.
 
-    line: axis and frequency of the strongest line in the capture.
+    line: axis and frequency of the strongest line in the capture. step: distance of its codes, None if all occur.
     """
 
     read_noise: float
@@ -40,6 +40,7 @@ class Scale:
     exposures_differ: bool  # of the darks
     light: float  # most photoelectrons of a flat, e-
     line: tuple[str, float]
+    step: float | None
 
     @staticmethod
     def of(model: NoiseModel, part: FrameStack) -> Scale:
@@ -55,6 +56,7 @@ class Scale:
             exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
             line=moving_line(part, [draw_capture(s, model, part) for s in LINE_SEEDS], black_level_of(model)),
+            step=code_step(part),
         )
 
 
@@ -96,7 +98,7 @@ def _read_out(s: Scale) -> dict[str, Maker]:
         "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
         "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * rng.choice([-1, 1]), 0.0),
         "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, taps=int(rng.choice([2, 4, 8]))),
-        "missing_codes": lambda f, rng: fx.MissingCodes(1.0 + min(f, 1.0) * rng.uniform(0.1, 1.5)),
+        "missing_codes": lambda f, rng: fx.MissingCodes(s.step or 1.0 + min(f, 1.0) * rng.uniform(0.1, 1.5)),
     }
 
 

@@ -19,7 +19,8 @@ class MissingCodes(AbstractEffect):
     stays, because the gain of the model is that of the whole camera. Add it after `adc`, so that it acts on counts.
     With gain 1, counts stay as they are.
 
-    In dark frames: gaps at regular distances in the histogram of counts, alike in all exposures.
+    In dark frames: gaps at regular distances in the histogram of counts, alike in all exposures. `diagnose` takes the
+    gain from there; a fit holds it.
 
     Attributes:
         white_level_dn: largest count, DN, to which stretched codes are clipped; None for that of the integer type.
@@ -29,7 +30,7 @@ class MissingCodes(AbstractEffect):
 
     name: ClassVar[str] = "missing_codes"
     stage: ClassVar[Stage] = Stage.DIGITAL
-    gain: Scalar = param("1", low=1, doc="digital gain: distance of two codes, DN, before the last rounding")
+    gain: Scalar = param("1", low=1, held=True, doc="digital gain: distance of two codes, DN; fits hold it")
     white_level_dn: float | None = eqx.field(static=True, default=None)
 
     def sample(self, signal: Frames | Counts, capture: Capture, *, key: RandomKey) -> Frames | Counts:

@@ -15,9 +15,10 @@ import numpy as np
 from hsnoise.stack import FrameStack
 from hsnoise.structure import _lines, _pixels, _views
 from hsnoise.structure._anova import Exposure, Layout, layout_of, read_exposure
+from hsnoise.structure._codes import code_step
 from hsnoise.structure._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["Structure", "moving_line", "structure"]
+__all__ = ["Structure", "code_step", "moving_line", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
