@@ -239,7 +239,7 @@ def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
 def _fit_with_progress(stack: FrameStack, method: str) -> FitResult:
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("Reading frames", total=sum(stack.n_frames))
 
         def tick() -> None:
@@ -257,8 +257,21 @@ def _improve_with_progress(stack: FrameStack, seed: int) -> Story:
 
 @contextmanager
 def _busy(text: str) -> Iterator[Callable[[str], None]]:
-    """A spinner with the time that has passed; the value changes its text."""
+    """A spinner with the time that has passed, or lines where there is no terminal; the value changes its text."""
     console = Console(stderr=True)
+    if not console.is_terminal:
+        print(text, file=sys.stderr, flush=True)
+        told = {text}
+
+        def tell(sentence: str) -> None:
+            stage, _, number = sentence.rpartition(": ")
+            stage = stage if number.isdigit() else sentence
+            if stage not in told:
+                told.add(stage)
+                print(stage, file=sys.stderr, flush=True)
+
+        yield tell
+        return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(text, total=None)

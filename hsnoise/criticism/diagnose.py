@@ -45,6 +45,11 @@ MISFIT_LEFT, SHARE_LEFT, MOST_LEFT = 3.5, 0.05, 10.0
 NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a part of the explanation
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
+LEGEND = (
+    "score: log-likelihood ratio of this effect alone against nothing missing; misfit left: normal score of the worst"
+    " statistics with it in the model (below 3.5 nothing stands out)"
+)
+NEXT = "next: hsnoise improve, or in Python hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
 
@@ -88,6 +93,11 @@ class Diagnosis:
             return self.verdict
         return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
 
+    @property
+    def named(self) -> tuple[Candidate, ...]:
+        """The candidates that the verdict names."""
+        return tuple(c for c in self.ranking if c.name in self.names)
+
     def plot(self):
         """A figure of the ranking: `hsnoise.plots.ranking`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -97,15 +107,29 @@ class Diagnosis:
     def __str__(self) -> str:
         table = Table("effect", "score / nats", "p", "misfit left")
         for c in self.ranking[:WORST]:
-            table.add_row(c.name, f"{c.score:.1f}", f"{c.p_value:.2g}", f"{c.misfit:.1f}")
+            p_value = "< 1e-300" if c.p_value == 0 else f"{c.p_value:.2g}"
+            table.add_row(c.name, f"{c.score:.1f}", p_value, f"{c.misfit:.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
         console.print(table)
-        if self.advice:
-            console.print(f"- {self.advice}", highlight=False)
+        for sentence in (LEGEND, *map(_described, self.named), self.advice, NEXT if self.best is not None else ""):
+            if sentence:
+                console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+
+def _described(candidate: Candidate) -> str:
+    """What an effect is, and the first estimate of its parameters."""
+    effect = candidate.effect
+    values = []
+    for field, spec in effect.specs().items():
+        value = np.array2string(np.asarray(getattr(effect, field)), precision=3)
+        values.append(f"{field} {value}" if spec.unit == "1" else f"{field} {value} {spec.unit}")
+    values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
+    about = (type(effect).__doc__ or "").strip().partition("\n")[0]
+    return f"{effect.name}: {about} First estimate: {', '.join(values)}."
 
 
 def diagnose(

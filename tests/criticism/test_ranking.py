@@ -14,7 +14,8 @@ from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pairs, closest, judge
 
-decide = importlib.import_module("hsnoise.criticism.diagnose")._verdict  # the package has a function of that name
+verdicts = importlib.import_module("hsnoise.criticism.diagnose")  # the package has a function of that name
+decide = verdicts._verdict
 
 STATISTICS, AMPLITUDES = 40, (0.35, 1.0, 2.5)
 NAMES = tuple(f"statistic {i}" for i in range(STATISTICS))
@@ -38,6 +39,13 @@ def evidence(*hidden: Fingerprint, amplitude: float = 0.8) -> Evidence:
     noise = np.random.default_rng(5).standard_normal(STATISTICS)
     z = noise + sum(of.at(amplitude).mean(0) for of in hidden)
     return Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), NAMES, GROUPS, len(PRINTS))
+
+
+def test_a_named_effect_is_described_with_its_size_and_what_to_do_next():
+    one = Candidate("periodic_banding", fx.PeriodicBanding(0.8, 0.2866), 930.0, 0.0, 1.2)
+    told = str(verdicts.Diagnosis((one,), "named", one, (one.name,), "", verdicts.Unexplained(1.2, "tails", ())))
+    for words in ("amplitude 0.8 e-, frequency 0.287 cycles/pixel, axis", "< 1e-300", "next: hsnoise improve"):
+        assert words in " ".join(told.split())
 
 
 def test_single_effect_is_first_and_leaves_nothing():
