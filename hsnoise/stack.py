@@ -348,6 +348,6 @@ def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
         raise TypeError(
             f"expected a FrameStack or an array of counts, got the path {array_or_stack!r}; hsnoise.load reads files"
         )
-    if not hasattr(array_or_stack, "__len__"):
+    if not hasattr(array_or_stack, "__len__") and not hasattr(array_or_stack, "shape"):
         raise TypeError(f"stack: expected a FrameStack or an array of counts, got {type(array_or_stack).__name__}")
     return FrameStack(array_or_stack, **keywords)
