@@ -34,6 +34,7 @@ class Validation:
         white_e = float(np.sqrt(np.prod(camera.white_e)))
         clean, noisy = [], []
         side = min(CROP, *(n // 2 * 2 for clip in clips for n in clip.frames.shape[1:3]))
+        frames = min(frames, *(len(clip.frames) for clip in clips))
         for i, clip in enumerate(clips[:MOST_CLIPS]):
             row, column = ((n - side) // 2 for n in clip.frames.shape[1:3])
             light = light_of_frames(clip.frames[:frames, row : row + side, column : column + side], camera.channels)

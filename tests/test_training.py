@@ -16,6 +16,7 @@ from benchmarks._clips import Clip, crops, held_out, moving_stills, read_clips
 from benchmarks._noisy import OPTICS, Camera, camera_of, jittered, matched, noise_of
 from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._training import Recipe, Trainer, batch_rng, examples
+from benchmarks._validation import Validation
 from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
 from hsnoise._types import cfa_tile
 from hsnoise.effects import ADC, BlackLevel, Gain, ReadNoise, ShotNoise
@@ -155,6 +156,13 @@ def test_a_short_clip_is_played_forth_and_back():
     batch = crops([Clip("short", frames)], batch_rng(0, 0), 64, 7, 8)[:, :, 0, 0, 0].astype(int)
     assert set(np.unique(np.abs(np.diff(batch)))) == {1}  # no jump, no frame twice
     assert {0, 3} == set(batch.min(1)) | set(batch.max(1)) and len(np.unique(batch[:, 0])) == 4
+
+
+def test_validation_takes_clips_of_different_lengths(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (9, 16, 16, 3), dtype=np.uint8)
+    clips = [Clip("short", frames[:4]), Clip("long", frames)]
+    validation = Validation(clips, camera_of("canon_5d3", None, None), 6, tmp_path)
+    assert validation.clean.shape == validation.noisy.shape == (4, 2, 16, 16, 3)
 
 
 def test_examples_have_the_light_of_the_clip_as_their_mean():
