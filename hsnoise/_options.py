@@ -81,12 +81,12 @@ def _loop_arguments(commands: Any) -> None:
     for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):
         if name == "diagnose":
             _method_argument(parser)
-        if name != "improve":
-            parser.add_argument(
-                "--model",
-                required=name == "compare",
-                help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}",
-            )
+        start = "where to start (default: the paper's model): " if name == "improve" else ""
+        parser.add_argument(
+            "--model",
+            required=name == "compare",
+            help=f"{start}model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}",
+        )
         parser.add_argument(
             "paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes"
         )

@@ -5,23 +5,21 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import itertools
 import re
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, track
+from rich.progress import track
 
 import hsnoise
 from hsnoise import _enhance, _options, cameras, report
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically, write_figure
+from hsnoise._progress import busy, counter, fit_with_progress
 from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
@@ -97,7 +95,7 @@ def _demo(args: argparse.Namespace) -> None:
         stack, truth, source = *_simulated(args.out), {"simulated": "canon_5d3 with row noise", "seed": DEMO_SEED}
     args.out.mkdir(parents=True, exist_ok=True)
     print(f"{stack}\nFitting them, finding what the model lacks, and fitting again: a few minutes ...")
-    story = _improve_with_progress(stack, DEMO_SEED)
+    story = _improve_with_progress(stack, DEMO_SEED, args.out, source)
     _tell(story, args.out, source, truth)
     if truth is not None:
         print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
@@ -125,7 +123,7 @@ def _fit(args: argparse.Namespace) -> None:
     console, out = Console(highlight=False), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
-    fit = _fit_with_progress(stack, args.method)
+    fit = fit_with_progress(stack, args.method)
     console.print(table_of(fit))
     console.print(
         f"Fit by {'maximum likelihood' if fit.method == 'ml' else 'the line method'}: {fit.outcome}", markup=False
@@ -142,8 +140,8 @@ def _compare(args: argparse.Namespace) -> None:
     model, stack = _model(args.model), _load(args.paths, args)
     check_fits(model, stack)
     args.out.mkdir(parents=True, exist_ok=True)
-    with _busy("Drawing from the model") as say:
-        found = hsnoise.compare(model, stack, seed=args.seed, progress=_counter(say, "Captures drawn from the model"))
+    with busy("Drawing from the model") as say:
+        found = hsnoise.compare(model, stack, seed=args.seed, progress=counter(say, "Captures drawn from the model"))
     _show(found, args.out / "comparison.png")
     _write_report(args, found, stack, fit=model)
 
@@ -152,13 +150,13 @@ def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    fitted = _fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
-    with _busy("Drawing every effect that may be missing") as say:
-        tick = _counter(say, "Captures drawn with effects that may be missing")
+    fitted = fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
+    with busy("Drawing every effect that may be missing") as say:
+        tick = counter(say, "Captures drawn with effects that may be missing")
         found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=tick)
     _show(found, args.out / "ranking.png")
     if args.report is not None:
-        with _busy("Comparing with the model's own samples"):
+        with busy("Comparing with the model's own samples"):
             comparison = hsnoise.compare(getattr(fitted, "params", fitted), stack, seed=args.seed)
         _write_report(args, found, stack, fit=fitted, comparison=comparison)
 
@@ -167,9 +165,17 @@ def _improve(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args.paths, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    story = _improve_with_progress(stack, args.seed)
-    _tell(story, args.out, {"files": args.paths}, None)
+    start, source = None if args.model is None else _model(args.model), {"files": args.paths}
+    story = _improve_with_progress(stack, args.seed, args.out, source, start)
+    _tell(story, args.out, source, None)
     _write_report(args, story, stack)
+
+
+def _keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
+    """Write the last model and the story to `out`; returns the names of the files."""
+    written = _write_results(story.fit, out, {**source, "errors": list(story.errors)}, figures=False)
+    write_atomically(out / "story.txt", f"{story}\n".encode())
+    return [*written, "story.txt"]
 
 
 def _tell(story: Story, out: Path, source: dict[str, Any], truth: NoiseModel | None) -> None:
@@ -179,9 +185,7 @@ def _tell(story: Story, out: Path, source: dict[str, Any], truth: NoiseModel | N
     console.print(table_of(story.fit, truth))
     for note in story.fit.notes:
         console.print(f"- {note}", style="yellow", markup=False)
-    written = _write_results(story.fit, out, {**source, "errors": list(story.errors)}, figures=False)
-    write_atomically(out / "story.txt", f"{story}\n".encode())
-    print(f"Written to {out}/: {', '.join(written)}, story.txt")
+    print(f"Written to {out}/: {', '.join(_keep(story, out, source))}")
 
 
 def _sample(args: argparse.Namespace) -> None:
@@ -236,51 +240,14 @@ def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
     return [hsnoise.load(path, **options) for path in paths]
 
 
-def _fit_with_progress(stack: FrameStack, method: str) -> FitResult:
-    console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("Reading frames", total=sum(stack.n_frames))
-
-        def tick() -> None:
-            progress.advance(task)
-            if progress.finished:
-                progress.add_task("Fitting", total=None)
-
-        return hsnoise.fit(stack, method=method, progress=tick)
-
-
-def _improve_with_progress(stack: FrameStack, seed: int) -> Story:
-    with _busy("Fitting the paper's model") as say:
-        return hsnoise.improve(stack, seed=seed, progress=say)
-
-
-@contextmanager
-def _busy(text: str) -> Iterator[Callable[[str], None]]:
-    """A spinner with the time that has passed, or lines where there is no terminal; the value changes its text."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        print(text, file=sys.stderr, flush=True)
-        told = {text}
-
-        def tell(sentence: str) -> None:
-            stage, _, number = sentence.rpartition(": ")
-            stage = stage if number.isdigit() else sentence
-            if stage not in told:
-                told.add(stage)
-                print(stage, file=sys.stderr, flush=True)
-
-        yield tell
-        return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(text, total=None)
-        yield lambda sentence: progress.update(task, description=sentence)
-
-
-def _counter(say: Callable[[str], None], text: str) -> Callable[[], None]:
-    numbers = itertools.count(1)
-    return lambda: say(f"{text}: {next(numbers)}")
+def _improve_with_progress(
+    stack: FrameStack, seed: int, out: Path, source: dict[str, Any], start: NoiseModel | None = None
+) -> Story:
+    """The loop; each model that it keeps is written to `out`."""
+    with busy("Fitting the first model") as say:
+        return hsnoise.improve(
+            stack, model=start, seed=seed, progress=say, keep=lambda story: _keep(story, out, source)
+        )
 
 
 def _show(found, path: Path) -> None:
@@ -294,7 +261,7 @@ def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords
     """Write the page that --report asks for, if it does."""
     if args.report is None:
         return
-    with _busy("Writing the report"):
+    with busy("Writing the report"):
         report.write_report(args.report, found, stack, files=args.paths, seed=args.seed, **keywords)
     print(f"Reported in {args.report}")
 

@@ -14,10 +14,10 @@ from hsnoise._types import cfa_tile
 from hsnoise.effects import Stage
 from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 from hsnoise.stack import FrameStack
+from hsnoise.structure import check_size
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
-SMALLEST = 32  # rows and columns
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
 FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
@@ -34,9 +34,7 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
     darks, for frames that are copies, and for frames too small to tell rows from pixels.
     """
-    if min(stack.shape) < SMALLEST:
-        rows, columns = stack.shape
-        raise ValueError(f"stack: expected frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}")
+    check_size(stack)
     if "dark" not in stack.kind:
         raise ValueError("stack: expected dark frames, got flats only")
     chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]

@@ -91,10 +91,11 @@ def test_fitted_model_can_be_sampled(fitted, tmp_path, capsys):
 def short_loop(monkeypatch):
     """The loop without its draws: the first fit, and an addition made up."""
 
-    def improve(stack, **_):
+    def improve(stack, *, keep, **_):
         fit, groups = hsnoise.fit(stack), {"noise": 1.0}
         errors = [Comparison(error, groups, (), (), 0.5, -3.0, ()) for error in (40.0, 1.2)]
         steps = [Step(fit, e, None, added, -9.0, ()) for e, added in zip(errors, (None, "row_noise"), strict=True)]
+        keep(Story((steps[0],), "Not finished."))
         return Story(tuple(steps), "Nothing significant is left.")
 
     monkeypatch.setattr(hsnoise, "improve", improve)
@@ -114,6 +115,20 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert {path.name for path in out.iterdir()} >= {"capture.npz", "model.json", "table.csv", "story.png"}
     assert "truth" in said and "Hidden in these frames was row_noise" in said
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
+
+
+def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop):
+    whole = hsnoise.improve
+
+    def broken_off(stack, **keywords):
+        whole(stack, **keywords)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hsnoise, "improve", broken_off)
+    arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
+    assert main(arguments) == 130
+    assert "Not finished" in (tmp_path / "story.txt").read_text()
+    assert "read_noise" in hsnoise.NoiseModel.load(tmp_path / "model.json")
 
 
 def test_demo_takes_data(capture, tmp_path, capsys, short_loop):

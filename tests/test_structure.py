@@ -182,7 +182,7 @@ def test_colours_and_levels_are_those_of_the_planes(rng):
         counts = np.rint(rng.normal(np.tile(tile, (32, 32)), 2.0, (3, 64, 64))).astype(np.uint16)
         found = structure(hsnoise.FrameStack(counts, [0.1], cfa=cfa), np.array([60.0, 64.0, 70.0]))
         values = dict(zip(found.names, found.values, strict=True))
-        got = [values[f"level: mean above black, DN, {c}, all"] for c in "RGB"]
+        got = [values[f"level: mean above black, DN, {c}, all frames"] for c in "RGB"]
         np.testing.assert_allclose(got, [20.0, 26.0, 50.0], atol=0.15)
 
 
@@ -199,27 +199,27 @@ def test_clean_draws_have_no_correlations(camera):
 
 # Effect, the statistic that must react, and its direction.
 REACTIONS = [
-    (SharedRowGain(0.3, 1.0), "row x frame: correlation, same row of G-R, high", 1),
-    (RowNoise(1.5), "row x frame: correlation, same row of G-R, low", 1),
-    (ColumnNoise(1.0), "column x frame: correlation, same column, low", 1),
-    (RowFixedPattern(1.0), "static rows: correlation of exposures, profile, low-low", 1),
-    (ColumnFixedPattern(0.6), "static columns: correlation of exposures, profile, low-high", 1),
-    (FrameOffset(0.6), "frames over time: frame mean / pixel, low", 1),
-    (DarkSignalNonuniformity(1.5), "static pixels: correlation of exposures, map, low-low", 1),
-    (HotPixels(0.005, 2000.0), "static pixels: pixels of the map above 7 sigma, high", 1),
-    (AmplifierGlow(40.0, 0.3), "blocks: static map, mixed low-order shape, high", 1),
-    (RandomTelegraphNoise(0.05, 12.0, 0.4), "pixels over time: correlation of exposures, variance, low-low", 1),
-    (HeavyTailedReadNoise(4.0), "tails: log kurtosis, G, low", 1),
-    (ReadNoiseNonuniformity(0.4), "pixels over time: correlation of exposures, log variance, low-low", 1),
-    (PeriodicBanding(1.5, 0.13), "row spectrum: peak of the spectrum, low", 1),
-    (Crosstalk(0.04), "spatial lags: residual, 1 rows 0 columns away, high", 1),
-    (ReadoutBandwidth(0.06), "spatial lags: residual, 0 rows 1 columns away, low", 1),
-    (ImageLag(0.1), "pixels over time: residual, next frame, high", 1),
-    (OddEvenPattern(1.0), "static columns: parity, low", 1),
-    (TapOffsets(1.0, taps=4), "static columns: steps of 8, low", 1),
-    (MissingCodes(1.7), "codes: roughness of the histogram, high", 1),
+    (SharedRowGain(0.3, 1.0), "row x frame: correlation, same row of G-R, long exposures", 1),
+    (RowNoise(1.5), "row x frame: correlation, same row of G-R, short exposures", 1),
+    (ColumnNoise(1.0), "column x frame: correlation, same column, short exposures", 1),
+    (RowFixedPattern(1.0), "static rows: correlation of exposures, profile, short and short", 1),
+    (ColumnFixedPattern(0.6), "static columns: correlation of exposures, profile, short and long", 1),
+    (FrameOffset(0.6), "frames over time: frame mean / pixel, short exposures", 1),
+    (DarkSignalNonuniformity(1.5), "static pixels: correlation of exposures, map, short and short", 1),
+    (HotPixels(0.005, 2000.0), "static pixels: pixels of the map above 7 sigma, long exposures", 1),
+    (AmplifierGlow(40.0, 0.3), "blocks: static map, mixed low-order shape, long exposures", 1),
+    (RandomTelegraphNoise(0.05, 12.0, 0.4), "pixels over time: correlation of exposures, variance, short and short", 1),
+    (HeavyTailedReadNoise(4.0), "tails: log kurtosis, G, short exposures", 1),
+    (ReadNoiseNonuniformity(0.4), "pixels over time: correlation of exposures, log variance, short and short", 1),
+    (PeriodicBanding(1.5, 0.13), "row spectrum: peak of the spectrum, short exposures", 1),
+    (Crosstalk(0.04), "spatial lags: residual, 1 rows 0 columns away, long exposures", 1),
+    (ReadoutBandwidth(0.06), "spatial lags: residual, 0 rows 1 columns away, short exposures", 1),
+    (ImageLag(0.1), "pixels over time: residual, next frame, long exposures", 1),
+    (OddEvenPattern(1.0), "static columns: parity, short exposures", 1),
+    (TapOffsets(1.0, taps=4), "static columns: steps of 8, short exposures", 1),
+    (MissingCodes(1.7), "codes: roughness of the histogram, long exposures", 1),
     (CosmicRays(1500.0, 500.0), "pixels over time: pixels with 1 outliers", 1),
-    (BlackClamp([70.0, 60.0, 65.0]), "level: mean above black, DN, G, high", -1),
+    (BlackClamp([70.0, 60.0, 65.0]), "level: mean above black, DN, G, long exposures", -1),
 ]
 
 
@@ -282,7 +282,7 @@ def test_the_distance_of_codes_is_found(step, black, rng):
 def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():
     names, mean, spread = clean("grasshopper3")
     lags = ("0 rows 1 columns", "1 rows 0 columns")
-    along, across = (names.index(f"spatial lags: residual, {lag} away, high") for lag in lags)
+    along, across = (names.index(f"spatial lags: residual, {lag} away, long exposures") for lag in lags)
     for effect, both in ((Crosstalk(0.04), True), (ReadoutBandwidth(0.06), False)):
         z = (draw("grasshopper3", effect, seed=100).values - mean) / spread
         assert z[along] > 5
@@ -291,7 +291,9 @@ def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():
 
 def test_row_gain_of_all_colours_grows_with_signal_and_row_noise_does_not():
     names, mean, spread = clean("grasshopper3")
-    low, high = (names.index(f"row x frame: correlation, same row of G-R, {half}") for half in ("low", "high"))
+    low, high = (
+        names.index(f"row x frame: correlation, same row of G-R, {half} exposures") for half in ("short", "long")
+    )
     noise_, gain = (draw("grasshopper3", e, seed=100).values - mean for e in (RowNoise(1.5), SharedRowGain(0.3)))
     assert noise_[low] > noise_[high] + 5 * spread[high]
     assert gain[high] > gain[low] + 5 * spread[high]

@@ -15,6 +15,7 @@ from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack, as_stack
+from hsnoise.structure import explained
 
 DRAWS = 40
 WORST = 5  # statistics told in words
@@ -56,9 +57,13 @@ class Comparison:
         for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
             table.add_row(name, f"{misfit:.2f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(f"error {self.error:.2f} (1.0: like the model's own samples)", highlight=False)
+        console.print(
+            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
+            f" {max(self.groups.values()):.3g}, over that of the model's own samples",
+            highlight=False,
+        )
         console.print(table)
-        for sentence in (*self.worst, *self.skipped):
+        for sentence in (*self.worst, *explained(self.worst), *self.skipped):
             console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 

@@ -46,8 +46,9 @@ NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 WORST = 5
 LEGEND = (
-    "score: log-likelihood ratio of this effect alone against nothing missing; misfit left: normal score of the worst"
-    " statistics with it in the model (below 3.5 nothing stands out)"
+    "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
+    " is meant); z left: normal score of the worst group of statistics with it in the model (below 3.5 nothing stands"
+    " out)"
 )
 NEXT = "next: hsnoise improve, or in Python hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
@@ -105,7 +106,7 @@ class Diagnosis:
         return plots.ranking(self)
 
     def __str__(self) -> str:
-        table = Table("effect", "score / nats", "p", "misfit left")
+        table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
             p_value = "< 1e-300" if c.p_value == 0 else f"{c.p_value:.2g}"
             table.add_row(c.name, f"{c.score:.1f}", p_value, f"{c.misfit:.1f}")

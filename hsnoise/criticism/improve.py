@@ -31,6 +31,7 @@ HELD_OUT_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 MOVED_SIGMA = 2.0
+UNFINISHED = "Not finished: whether something is missing was being looked for."
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Story:
 
 
 def improve(
-    stack, *, model: NoiseModel | None = None, candidates: Any = (), seed: int = 0, progress=None, **keywords
+    stack, *, model: NoiseModel | None = None, candidates: Any = (), seed: int = 0, progress=None, keep=None, **keywords
 ) -> Story:
     """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
 
@@ -119,14 +120,15 @@ def improve(
 
     Args:
         stack: FrameStack, or a bare array with FrameStack's keywords.
-        model: where to start; default: all effects of the paper.
+        model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
-        seed: of all draws. progress: called with a sentence at each stage.
+        seed: of all draws. progress: called with a sentence at each stage. keep: called with the story so far, after
+            each model that is kept, so that nothing is lost.
 
     Raises:
         TypeError, ValueError: bad input, before any long work.
     """
-    say = progress or (lambda sentence: None)
+    say, keep = progress or (lambda sentence: None), keep or (lambda story: None)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
@@ -137,6 +139,7 @@ def improve(
         if len(steps) > MOST_STEPS:
             return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.")
         last = steps[-1]
+        keep(Story(tuple(steps), UNFINISHED))
         say("Looking for what is missing")
         own = [c for c in candidates if c.name not in last.fit.params]
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)

@@ -11,6 +11,7 @@ from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, rounded
 from hsnoise.stack import FrameStack
+from hsnoise.structure import explained
 
 CHANCE = 0.05  # p-value from which a misfit is taken for chance,
 CLEAR = 3.0  # unless the error is beyond this: few draws give no small p-value
@@ -44,6 +45,7 @@ def context(
         "outcome": fit.outcome if isinstance(fit, FitResult) else "",
         "bars": None if comparison is None else bars(comparison),
         "comparison": comparison,
+        "words": () if comparison is None else explained(comparison.worst),
         "diagnosis": diagnosis,
         "ranking": [] if diagnosis is None else ranking(diagnosis),
         "story": None if story is None else steps(story),

@@ -23,7 +23,7 @@ MOST_BINS = 90
 
 @dataclass(frozen=True)
 class Shown:
-    """The longest dark exposure: frames [frame, row, column] measured, and of each draw of the model."""
+    """One dark exposure: frames [frame, row, column] measured, and of each draw of the model."""
 
     exposure_s: float
     cfa: str
@@ -32,19 +32,20 @@ class Shown:
     drawn: list[np.ndarray]
 
 
-def shown(stack: FrameStack, model: NoiseModel, seed: int) -> Shown:
-    """The longest dark exposure of `stack`, and as many draws of it as scatter needs.
+def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = False) -> Shown:
+    """The longest (shortest) dark exposure of `stack`, and as many draws of it as scatter needs.
 
     Raises:
         TypeError, ValueError: model and stack do not fit together, no darks.
     """
     check_fits(model, stack)
     darks = darks_of(stack).select(frames=slice(0, MOST_FRAMES))
-    longest = int(np.argmax(darks.exposure_s))
+    one_exposure = int(np.argmin(darks.exposure_s) if shortest else np.argmax(darks.exposure_s))
     seeds = [seed + SEED_APART + i for i in range(DRAWS)]
     # All exposures are drawn, because a stack of a single frame would be refused.
-    drawn = in_threads(lambda one: _frames(draw_capture(one, model, darks), longest), seeds)
-    return Shown(float(darks.exposure_s[longest]), darks.cfa, darks.channels, _frames(darks, longest), drawn)
+    drawn = in_threads(lambda one: _frames(draw_capture(one, model, darks), one_exposure), seeds)
+    exposure_s = float(darks.exposure_s[one_exposure])
+    return Shown(exposure_s, darks.cfa, darks.channels, _frames(darks, one_exposure), drawn)
 
 
 def _frames(stack: FrameStack, exposure: int) -> np.ndarray:

@@ -7,18 +7,18 @@ the camera. What decides between effects is mostly correlation: between colours,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hsnoise.stack import FrameStack
 from hsnoise.structure import _lines, _pixels, _views
-from hsnoise.structure._anova import Exposure, Layout, layout_of, read_exposure
+from hsnoise.structure._anova import Exposure, Layout, check_size, layout_of, read_exposure
 from hsnoise.structure._codes import code_step
 from hsnoise.structure._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["Structure", "code_step", "moving_line", "structure"]
+__all__ = ["SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,14 @@ class Structure:
     skipped: tuple[str, ...]
 
 
+SHORT = "short exposures"
+WORDS = {
+    SHORT: "short and long exposures: means over the shorter and the longer half of the exposure times",
+    " in band ": "bands: ranges of frequency over the rows or columns of a frame, from slow to fast",
+    "row x frame": "row x frame, column x frame: means of rows or columns that are new in each frame",
+    "static map": "static map: mean over the frames, what stays in place",
+}
+
 # What flats tell whatever the light: neither its level, its flicker nor its shape.
 FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
 
@@ -44,8 +52,8 @@ FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "ta
 def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     """The statistics of the exposures of a stack, darks and flats apart.
 
-    Exposures are averaged over the shorter half ("low") and the longer half ("high") of the exposure times. A single
-    exposure gives averages over all its frames; what persists is then compared between its even and odd frames.
+    Exposures are averaged over the shorter half and the longer half of the exposure times. A single exposure gives
+    averages over all its frames; what persists is then compared between its even and odd frames.
 
     Args:
         stack: the capture.
@@ -66,7 +74,7 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     """Statistics of the exposures of a layout by (group, what)."""
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
-    names = ("low", "high") if n > 1 else ("even", "odd")
+    names = ("short", "long") if n > 1 else ("even", "odd")
     capture = _Capture([], [], [], [], np.zeros(1, np.uint16))
     for number in range(n):
         x = read_exposure(stack, layout, number, black_level_dn)
@@ -74,10 +82,10 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     entries: dict[tuple[str, str], Entry] = {}
     for half in sorted(set(halves)):
         some = [i for i in range(n) if halves[i] == half]
-        entries |= gather([capture.sheets[i] for i in some], names[half] if n > 1 else "all")
+        entries |= gather([capture.sheets[i] for i in some], f"{names[half]} exposures" if n > 1 else "all frames")
         if n > 1:
-            entries |= _peaks([capture.spectra[i] for i in some], names[half])
-    entries |= _peaks(capture.spectra, "all")
+            entries |= _peaks([capture.spectra[i] for i in some], f"{names[half]} exposures")
+    entries |= _peaks(capture.spectra, "all exposures" if n > 1 else "all frames")
     if len(capture.views) > 1:
         entries |= _views.persistence(capture.views, names)
     if max(layout.frames) > 1:
@@ -131,6 +139,12 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
     return out
 
 
+def explained(names: Iterable[str]) -> tuple[str, ...]:
+    """Sentences on the words in names of statistics that are not plain."""
+    text = "; ".join(names)
+    return tuple(sentence for word, sentence in WORDS.items() if word in text)
+
+
 def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: np.ndarray) -> tuple[str, float]:
     """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each.
 
@@ -138,17 +152,19 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     half a cycle, as colours take turns.
     """
     layout = layout_of(stack)
+    used = {"row": layout.rows, "column": layout.columns}
 
-    def spectra(capture: FrameStack, axis: str) -> np.ndarray:
-        read = [read_exposure(capture, layout, i, black_level_dn) for i in range(len(layout.frames))]
-        return np.stack([_lines.periodograms(x)[f"{axis} x frame"] for x in read])
+    def spectra(capture: FrameStack) -> dict[str, np.ndarray]:
+        read = (read_exposure(capture, layout, i, black_level_dn) for i in range(len(layout.frames)))
+        found = [_lines.periodograms(x) for x in read]
+        return {axis: np.stack([of[f"{axis} x frame"] for of in found]) for axis in used}
 
     step = 1 if layout.cfa == "mono" else 2
+    expected = [spectra(drawn) for drawn in draws]
     found = []
-    for axis, used in (("row", layout.rows), ("column", layout.columns)):
-        expected = np.mean([spectra(drawn, axis) for drawn in draws], 0)
-        excess = (spectra(stack, axis) / expected).mean(0)
-        height, frequency = _lines.strongest_line(excess, (used.stop - used.start) // step * step)
+    for axis, lines in spectra(stack).items():
+        excess = (lines / np.mean([of[axis] for of in expected], 0)).mean(0)
+        height, frequency = _lines.strongest_line(excess, (used[axis].stop - used[axis].start) // step * step)
         found.append((height, axis, frequency))
     _, axis, frequency = max(found)
     return axis, frequency

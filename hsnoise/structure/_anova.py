@@ -12,6 +12,7 @@ from hsnoise.stack import FrameStack
 MOST_PIXELS = 1 << 25  # of one exposure: 32 Mpixel, about 0.7 GB at work
 MOST_FRAME_PIXELS = 1 << 22  # of one frame
 FEWEST_FRAMES = 4
+SMALLEST = 32  # rows and columns
 GAUSSIAN_ABS = np.sqrt(2 / np.pi)  # mean |x| of a standard normal x
 BOUND = 5.0
 MOST_CODES = 1 << 16
@@ -71,16 +72,20 @@ class Exposure:
         return self.residual.shape
 
 
+def check_size(stack: FrameStack) -> None:
+    """Raise ValueError for frames too small to tell rows from pixels."""
+    if min(stack.shape) < SMALLEST:
+        rows, columns = stack.shape
+        raise ValueError(f"stack: expected frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}")
+
+
 def layout_of(stack: FrameStack, kind: str = "dark") -> Layout:
     """Which exposures of a kind, frames and pixels of a stack are used, and sentences on what is not."""
     chosen = [i for i, one in enumerate(stack.kind) if one == kind]
     chosen.sort(key=lambda i: stack.exposure_s[i])
     if not chosen:
         raise ValueError("structure: expected at least one dark exposure, got none; its statistics are of dark frames")
-    if min(stack.shape) < 32:
-        raise ValueError(
-            f"structure: expected frames of at least 32 x 32 pixels, got {stack.shape[0]} x {stack.shape[1]}"
-        )
+    check_size(stack)
     rows, columns = _central(stack.shape)
     most = max(FEWEST_FRAMES, MOST_PIXELS // ((rows.stop - rows.start) * (columns.stop - columns.start)))
     frames = tuple(min(stack.n_frames[i], most) for i in chosen)

@@ -141,17 +141,17 @@ def spectra(sheet: Sheet, x: Exposure) -> None:
         waves = np.fft.rfft(moving)[..., 1:]
         power = np.square(np.abs(waves)).sum(1)
         edges = np.unique(np.rint(np.geomspace(1, power.shape[-1] + 1, BANDS + 1)).astype(int)) - 1
-        level = power.mean(-1)
+        level, bands = power.mean(-1), len(edges) - 1
         for band, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
             n = max(frames - 1, 1) * (high - low)
             value = log_ratio(power[:, low:high].mean(-1), level)
-            sheet.add(group, f"power in band {band + 1}", value, 1 / np.sqrt(n * planes))
+            sheet.add(group, f"power in band {band + 1} of {bands}", value, 1 / np.sqrt(n * planes))
             if planes == 4:
                 cut = waves[..., low:high]
                 cross = [(cut[j] * cut[i].conj()).real.sum() for j, i in pairs]
                 size = [power[j, low:high].sum() * power[i, low:high].sum() for j, i in pairs]
                 value = fisher(np.array(cross) / np.sqrt(np.maximum(size, 1e-60)))
-                sheet.add(group, f"coherence of colours in band {band + 1}", value, 1 / np.sqrt(4 * n))
+                sheet.add(group, f"coherence of colours in band {band + 1} of {bands}", value, 1 / np.sqrt(4 * n))
 
 
 def periodograms(x: Exposure) -> dict[str, np.ndarray]:

@@ -54,7 +54,7 @@ def _normalised(pixel: np.ndarray) -> np.ndarray:
 
 
 def persistence(views: list[View], names: tuple[str, str]) -> dict[tuple[str, str], Entry]:
-    """Correlations of maps and profiles between exposures: low-low, low-high and high-high."""
+    """Correlations of maps and profiles between exposures: both short, short and long, both long."""
     pixel = np.stack([view.pixel for view in views], 1)
     out = _pairs(views, names, pixel, "static pixels", "raw map")
     out |= _pairs(views, names, np.clip(pixel, -BOUND, BOUND), "static pixels", "map")
@@ -82,7 +82,7 @@ def _pairs(
     kinds: dict[str, list[float]] = {}
     for j in range(n_views):
         for i in range(j):
-            kinds.setdefault(f"{names[views[i].half]}-{names[views[j].half]}", []).append(values[i, j])
+            kinds.setdefault(f"{names[views[i].half]} and {names[views[j].half]}", []).append(values[i, j])
     error = 1 / np.sqrt(planes * flat.shape[-1])
     return {
         (group, f"correlation of exposures, {what}, {kind}"): Entry(float(np.mean(of)), float(error / np.sqrt(len(of))))
