@@ -129,7 +129,9 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
         )
 
     def cosmic(f: float, rng: np.random.Generator) -> AbstractEffect:
-        return fx.CosmicRays(40.0 * f / s.longest_s, rng.uniform(15, 80) * s.read_noise)
+        at_readout = rng.choice([0.05, 0.5, 0.95])  # of the hits in the longest exposure
+        hits, charge = 40.0 * f, rng.uniform(15, 80) * s.read_noise
+        return fx.CosmicRays(hits * (1 - at_readout) / s.longest_s, charge, hits * at_readout)
 
     makers: dict[str, Maker] = {
         "amplifier_glow": spot,

@@ -17,7 +17,8 @@ class CosmicRays(AbstractEffect):
     Muons and decays in the sensor's surroundings leave some 80 electrons for each micrometre of silicon they cross.
     Tracks over several pixels are not described. Two hits of one pixel in one exposure count as one.
 
-    In dark frames: bright single pixels, in other places in each frame, their number in proportion to exposure.
+    In dark frames: bright single pixels, in other places in each frame, their number in proportion to exposure, beside
+    those that hit while a frame waits to be read.
 
     Reference: Groom, "Cosmic rays and other nonsense in astronomical CCD imagers", Exp. Astron. 14, 2002.
     """
@@ -27,10 +28,11 @@ class CosmicRays(AbstractEffect):
     adds: ClassVar[bool] = True
     rate: Scalar = param("1/(Mpixel s)", low=0, doc="hits of a million pixels in a second")
     charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
+    at_readout: Scalar = param("1/Mpixel", low=0, default=0.0, doc="hits of a million pixels whatever the exposure")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, again, how_much = jax.random.split(key, 3)
-        probability = -jnp.expm1(-1e-6 * self.rate * capture.exposure_s)
+        probability = -jnp.expm1(-1e-6 * (self.rate * capture.exposure_s + self.at_readout))
         # Two uniform numbers for one: those of float32 have steps of 1e-7, and hits may be a thousand times rarer.
         root = jnp.sqrt(probability)
         one, other = (jax.random.uniform(key, signal.shape, signal.dtype) for key in (where, again))

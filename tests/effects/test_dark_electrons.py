@@ -76,6 +76,8 @@ def test_cosmic_rays_are_rare_new_and_exponential():
     counts = hit.sum((1, 2))
     assert stats.chi2.sf(np.sum((counts - counts.mean()) ** 2) / counts.mean(), frames - 1) > P_VALUE
     assert np.all(darks(CosmicRays(2000.0, 900.0), 2, shape, exposure_s=0.0) == 0)
+    at_readout = (darks(CosmicRays(0.0, 900.0, 1000.0), frames, shape, exposure_s=0.0) > 0).sum()
+    assert abs(at_readout - per_pixel * hit.size) < 5 * np.sqrt(per_pixel * hit.size)
 
 
 def test_glow_has_a_finite_derivative_in_its_spot():
