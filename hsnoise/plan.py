@@ -133,22 +133,30 @@ def _scan(physics: Physics, c: int, summary: Summary, scale):
 
 def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Range of beta where the most extreme rows of a group keep any likelihood, and its best: [exposure, group]."""
-    low, high, peak = np.ones((3, *counts.shape[:2]))
-    index = np.arange(counts.shape[-1])
-    for e, curve in enumerate(table):
-        for g, group in enumerate(counts[e]):
-            group = group[group.any(-1)].astype(np.float64)
-            if not len(group):
-                continue
-            mean = group @ index / group.sum(1)
-            spread = group @ index**2 / group.sum(1) - mean**2
-            ends = [*range(min(EXTREME_ROWS, len(group))), *range(-min(EXTREME_ROWS, len(group)), 0)]
-            chosen = sorted({int(i) for key in (mean, spread) for i in np.argsort(key)[ends]})
-            curves = group[chosen] @ curve.T
-            alive = np.flatnonzero((curves >= curves.max(1, keepdims=True) - KEEP_NATS).any(0))
-            if not len(alive):  # parameters so far out that no likelihood is finite
-                alive = np.array([0, len(beta[e]) - 1])
-            low[e, g] = beta[e, max(alive[0] - 1, 0)]
-            high[e, g] = beta[e, min(alive[-1] + 1, len(beta[e]) - 1)]
-            peak[e, g] = beta[e, np.argmax(group.sum(0) @ curve.T)]
+    ends = np.zeros((*counts.shape[:2], 4 * EXTREME_ROWS, counts.shape[-1]), counts.dtype)
+    for at in np.ndindex(counts.shape[:2]):
+        extreme = _extreme_rows(counts[at])
+        ends[at][: len(extreme)] = extreme
+    # In JAX: NumPy's threads get into each other's way where captures are planned side by side.
+    curves = np.asarray(jnp.einsum("egrb,enb->egrn", ends.astype(np.float64), table))
+    whole = np.asarray(jnp.einsum("egb,enb->egn", counts.sum(2, dtype=np.float64), table))
+    alive = (curves >= curves.max(-1, keepdims=True) - KEEP_NATS) & ends.any(-1)[..., None]
+    alive = alive.any(2)
+    alive |= ~alive.any(-1, keepdims=True)  # parameters so far out that no likelihood is finite
+    first, last = alive.argmax(-1), alive.shape[-1] - 1 - alive[..., ::-1].argmax(-1)
+    places = np.maximum(first - 1, 0), np.minimum(last + 1, alive.shape[-1] - 1), whole.argmax(-1)
+    empty = ~counts.any((2, 3))
+    low, high, peak = (np.where(empty, 1.0, np.take_along_axis(beta, place, 1)) for place in places)
     return low, high, peak
+
+
+def _extreme_rows(group: np.ndarray) -> np.ndarray:
+    """Histograms [row, bin] of the rows of a group whose counts are lowest, highest, narrowest and widest."""
+    group = group[group.any(-1)]
+    index = np.arange(group.shape[-1])
+    n = group.sum(1, dtype=np.int64)
+    mean = group @ index / n
+    spread = group @ index**2 / n - mean**2
+    most = min(EXTREME_ROWS, len(group))
+    orders = [np.argsort(key) for key in (mean, spread)]
+    return group[np.unique(np.concatenate([part for order in orders for part in (order[:most], order[-most:])]))]
