@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise._arguments import whole_number
+from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
@@ -88,7 +89,10 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     part = part_of(stack)
     check_effects(params, part)
     measured = measure(part, params)
-    own = reference(params, part, draws, seed, progress or (lambda: None))
+    own, per_pixel = in_threads(  # the likelihood is compiled while captures are drawn
+        lambda work: work(),
+        [lambda: reference(params, part, draws, seed, progress or (lambda: None)), lambda: _per_pixel(params, part)],
+    )
     z = own.z(measured.values)
     groups = misfits(z, own.groups)
     worst = max(groups.values())
@@ -100,7 +104,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         table=tuple((name, group, float(a), float(b), float(c)) for name, group, a, b, c in table),
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
-        log_likelihood_per_pixel=_per_pixel(params, darks_of(part)),
+        log_likelihood_per_pixel=per_pixel,
         skipped=(*measured.skipped, *_left_out(stack, part)),
     )
 
@@ -123,7 +127,8 @@ def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z
     )
 
 
-def _per_pixel(params: NoiseModel, darks) -> float:
+def _per_pixel(params: NoiseModel, part: FrameStack) -> float:
+    darks = darks_of(part)
     try:
         value = float(log_likelihood(params, darks))
     except ValueError:  # an effect that states no likelihood
