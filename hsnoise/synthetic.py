@@ -1,4 +1,4 @@
-"""Fitting effects that only say how they are drawn: by simulated statistics, together with the base parameters.
+"""Fitting effects that only say how they are drawn, by simulated statistics, together with the base parameters.
 
 The statistics are those of the capture's structure, and the score (gradient of the exact base likelihood at the base
 fit), which carries all that the likelihood knows of the base parameters. Their expectation and covariance are
@@ -9,7 +9,7 @@ simulated with common random numbers, and the parameters sought at which the exp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,9 @@ from hsnoise.statistics import coding_of, summarise, without_counts
 from hsnoise.structure import structure
 
 COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
-MOST_SLOPES, MOST_ITERATIONS = 4, 16  # derivatives cost four times what means do, and change little near the end
+MOST_SLOPES, MOST_ITERATIONS = 4, 20  # derivatives cost four times what means do, and change little near the end
+SLACK, MUCH_LESS = 0.02, 0.8  # of the cost: rare counts make it rough; a step for which old derivatives are good enough
+LEAST_DAMPING = 0.1  # of the information, once a step failed
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # for derivatives: standard errors, and for effects at most this in the logarithm
@@ -98,9 +100,9 @@ def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
         for field, spec in effect.specs().items():
             for place in [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]:
                 label = next(labels)
-                value = abs(float(np.asarray(getattr(effect, field))[place]))
-                size = value if 0 < value < SMALL else 1.0
-                if not spec.held:
+                value = float(np.asarray(getattr(effect, field))[place])
+                size = abs(value) if 0 < abs(value) < SMALL else 1.0
+                if not spec.holds(value):
                     found.append(Knob(label, name, field, place, spec.low, spec.high, size))
     return found
 
@@ -234,33 +236,67 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     """
     part, tick = part_of(stack), progress or (lambda: None)
     extra = tuple(name for name in model.names if name not in base.params)
-    whole = base.params
-    for name in extra:
-        whole = whole.add(model[name])
+    whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
     problem = Problem(part, base, whole, extra, knobs(whole, extra), seed)
-    measured, _ = problem.statistics(part)
-    y = problem.start
-    scale, weight = _weights(problem, y, tick)
-    prior, last_step, sure = problem.prior, np.inf, False
-    by = np.where(np.arange(len(y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
-    for iteration in range(1, MOST_ITERATIONS + 1):
+    return _result(problem, *_search(problem, tick))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Statistics of draws at y [draw, statistic], and how far they are from the measured ones, the prior included."""
+
+    y: np.ndarray
+    drawn: np.ndarray
+    cost: float
+
+
+def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
+
+    Gauss-Newton, with Levenberg's damping where a step leads away.
+    """
+    measured, _ = problem.statistics(problem.part)
+    scale, weight = _weights(problem, problem.start, tick)
+    prior = problem.prior
+
+    def point(y: np.ndarray) -> _Point:
         drawn = _draws(problem, y, tick)
-        if not sure:
-            slopes = _slopes(problem, y, by, drawn, tick) / scale[:, None]
+        off = (measured - drawn.mean(0)) / scale
+        return _Point(y, drawn, float(off @ weight @ off + prior @ (y - problem.start) ** 2))
+
+    here, damping, taken, wanted, fresh, iterations = point(problem.start), 0.0, 0, True, False, 0
+    by = np.where(np.arange(len(here.y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
+    while iterations < MOST_ITERATIONS:
+        iterations += 1
+        if wanted:
+            slopes = _slopes(problem, here.y, by, here.drawn, tick) / scale[:, None]
             information = slopes.T @ weight @ slopes + np.diag(prior)
             covariance, gain = np.linalg.inv(information), slopes.T @ weight
-            by = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance)))
-            sure = last_step < SURE_STEP or iteration == MOST_SLOPES
-        step = covariance @ (gain @ ((measured - drawn.mean(0)) / scale) - prior * (y - problem.start))
-        if not np.isfinite(step).all():
-            at = [f"{k.label} {k.inverse(x):.3g}" for k, x in zip(problem.knobs, y[len(problem.centre) :], strict=True)]
-            raise RuntimeError(f"statistics of draws are not finite at {', '.join(at)}; fit from another start")
-        y = y + step * problem.share_of(step)
-        last_step = float(np.abs(step / np.sqrt(np.diagonal(covariance))).max())
-        if sure and last_step < SHORT_STEP:
+            by, taken = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance))), taken + 1
+            fresh = True
+        slope = gain @ ((measured - here.drawn.mean(0)) / scale) - prior * (here.y - problem.start)
+        length = float(np.abs(covariance @ slope / np.sqrt(np.diagonal(covariance))).max())
+        if not np.isfinite(length):
+            raise RuntimeError(_not_finite(problem, here.y))
+        step = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), slope)
+        ahead = here.y + step * problem.share_of(step)
+        if length < SHORT_STEP:
+            here = replace(here, y=ahead)
             break
-    covariance = _as_scattered(covariance, gain, (drawn - drawn.mean(0)) / scale)
-    return _result(problem, y, covariance, last_step, iteration)
+        there = point(ahead)
+        if there.cost < (1 + SLACK) * here.cost + 1:
+            most = MOST_SLOPES if there.cost < MUCH_LESS * here.cost else 2 * MOST_SLOPES
+            wanted = length >= SURE_STEP and taken < most
+            here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
+        else:
+            damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
+    covariance = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
+    return here.y, covariance, length, iterations
+
+
+def _not_finite(problem: Problem, y: np.ndarray) -> str:
+    at = [f"{k.label} {k.inverse(x):.3g}" for k, x in zip(problem.knobs, y[len(problem.centre) :], strict=True)]
+    return f"statistics of draws are not finite at {', '.join(at)}; fit from another start"
 
 
 def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float, iterations: int) -> FitResult:

@@ -9,7 +9,16 @@ import pytest
 import hsnoise
 from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
-from hsnoise.synthetic import Problem, _as_scattered, _not_surer_than, fit_synthetic, knobs
+from hsnoise.synthetic import (
+    MOST_ITERATIONS,
+    SHORT_STEP,
+    Problem,
+    _as_scattered,
+    _not_surer_than,
+    _search,
+    fit_synthetic,
+    knobs,
+)
 
 STATISTICS, NUMBERS = 60, 3
 SLOPES = np.random.default_rng(0).standard_normal((STATISTICS, NUMBERS))
@@ -79,8 +88,8 @@ def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
 @pytest.mark.parametrize(
     ("effect", "label"),
     [
-        (fx.AmplifierGlow(10.0, 0.3), "amplifier_glow.row"),  # at its upper bound
-        (fx.AmplifierGlow(10.0, 0.3, row=0.0), "amplifier_glow.row"),  # at its lower bound
+        (fx.Crosstalk(0.25), "crosstalk.fraction"),  # at its upper bound
+        (fx.AmplifierGlow(10.0, 0.3, row=0.5), "amplifier_glow.row"),
         (fx.HotPixels(0.004, 300.0), "hot_pixels.fraction"),
         (fx.Nonlinearity(1e-5), "nonlinearity.curvature"),  # tiny in its unit
     ],
@@ -97,6 +106,34 @@ def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, lab
 def test_what_an_effect_holds_is_no_knob():
     model = hsnoise.cameras.grasshopper3().add(fx.PeriodicBanding(1.0, 0.2))
     assert [k.label for k in knobs(model, ("periodic_banding",))] == ["periodic_banding.amplitude"]
+    edge = hsnoise.cameras.grasshopper3().add(fx.AmplifierGlow(10.0, 0.3, row=0.5, column=1.0))
+    labels = [k.label for k in knobs(edge, ("amplifier_glow",))]
+    assert labels == [f"amplifier_glow.{name}" for name in ("rate", "scale", "row", "aspect")]
+
+
+class Bent:
+    """A problem whose statistics are arcs of the first number: Newton's steps from far away lead further away."""
+
+    part, knobs, centre = None, (), np.zeros(0)
+    start, truth, prior = np.array([2.5, 0.3]), np.array([0.2, -0.1]), np.full(2, 1e-6)
+
+    def draw(self, y, number):
+        noise = np.random.default_rng(number).standard_normal(40)
+        return 30 * np.repeat([np.arctan(y[0]), y[1]], 20) + noise, np.full(40, 0.3)
+
+    def statistics(self, part):
+        return self.draw(self.truth, 999)
+
+    def share_of(self, step):
+        return 1.0
+
+
+def test_a_step_that_leads_away_is_taken_back():
+    problem = Bent()
+    y, covariance, length, iterations = _search(problem, lambda: None)
+    assert length < SHORT_STEP and iterations < MOST_ITERATIONS
+    assert np.all(np.abs(y - problem.truth) < 4 * np.sqrt(np.diagonal(covariance)))
+    assert np.all(np.sqrt(np.diagonal(covariance)) < 0.05)
 
 
 def test_what_a_line_fit_does_not_know_stays_unknown():

@@ -18,7 +18,7 @@ An effect of one's own is a class of about 20 lines in one's own file:
 import abc
 import dataclasses
 import enum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -70,7 +70,11 @@ class ParameterSpec:
     high: float | None
     per_channel: bool
     doc: str
-    held: bool
+    held: bool | Literal["at bounds"]
+
+    def holds(self, value: float) -> bool:
+        """Whether a fit leaves a parameter of this value where it is."""
+        return value in (self.low, self.high) if self.held == "at bounds" else self.held
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +99,7 @@ def param(
     per_channel: bool = False,
     default: float | None = None,
     doc: str = "",
-    held: bool = False,
+    held: bool | Literal["at bounds"] = False,
 ) -> Any:
     """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
 
@@ -105,7 +109,8 @@ def param(
         per_channel: one value per colour channel; a scalar given instead holds for all channels.
         default: value unless one is given; None: one must be given.
         doc: its meaning in a few words.
-        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly.
+        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly. "at bounds": only
+            if it lies at one, such as a place at the edge of the frame.
     """
     spec = ParameterSpec(unit, low, high, per_channel, doc, held)
     metadata = {"parameter": spec}

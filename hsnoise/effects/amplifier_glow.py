@@ -15,7 +15,8 @@ class AmplifierGlow(AbstractEffect):
 
     Transistors in saturation emit infrared light that the neighbouring pixels see. Distances are in units of the
     frame's diagonal, those along the rows divided by `aspect`; the spot lies anywhere in the frame, by default in the
-    corner of the last row and column.
+    corner of the last row and column. Fits leave it at an edge if it lies there, as amplifiers lie beyond: a spot a
+    little inside is hard to tell from another shape.
 
     In dark frames: a smooth brightening toward a corner or edge that grows in proportion to exposure, with its shot
     noise.
@@ -28,9 +29,12 @@ class AmplifierGlow(AbstractEffect):
     adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, doc="electrons of a pixel in a second where the glow is brightest")
     scale: Scalar = param("1", low=0.01, doc="distance over which the glow falls by e, in diagonals of the frame")
-    row: Scalar = param("1", low=0, high=1, default=1.0, doc="row of the brightest spot: 0 the first, 1 the last")
-    column: Scalar = param("1", low=0, high=1, default=1.0, doc="column of the brightest spot: 0 the first, 1 the last")
-
+    row: Scalar = param(
+        "1", low=0, high=1, default=1.0, held="at bounds", doc="row of the brightest spot: 0 the first, 1 the last"
+    )
+    column: Scalar = param(
+        "1", low=0, high=1, default=1.0, held="at bounds", doc="column of the brightest spot: 0 the first, 1 the last"
+    )
     aspect: Scalar = param("1", low=0.1, high=10, default=1.0, doc="width of the glow over its height")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
