@@ -1,4 +1,4 @@
-"""Arguments of a `FrameStack`, checked one by one; errors say what was expected and what came."""
+"""Arguments of a `FrameStack` and of `sample`, checked one by one; errors say what was expected and what came."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._frames import LazyFrames
-from hsnoise._types import Window
+from hsnoise._types import Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
 
@@ -222,3 +223,33 @@ def temperatures(temperature_c: Any, n: int) -> np.ndarray | None:
     value = np.full(n, temperature_c) if np.ndim(temperature_c) == 0 else temperature_c
     celsius = numbers("temperature_c", value, n, "exposure")
     return None if np.isnan(celsius).all() else celsius
+
+
+def checked_light(clean, cfa: str):
+    """The array, and its lowest and highest value; NaN if it is traced."""
+    clean = clean if isinstance(clean, jax.Array) else np.asarray(clean)
+    if not (jnp.issubdtype(clean.dtype, jnp.integer) or jnp.issubdtype(clean.dtype, jnp.floating)):
+        raise TypeError(f"clean: expected real numbers (photoelectrons), got dtype {clean.dtype}.")
+    if clean.ndim < 2 or clean.size == 0:
+        raise ValueError(f"clean: expected photoelectrons [..., row, column], got shape {clean.shape}.")
+    period = len(cfa_tile(cfa))
+    if clean.shape[-2] % period or clean.shape[-1] % period:
+        raise ValueError(f"clean: expected even rows and columns for cfa {cfa}, got {clean.shape[-2:]}.")
+    if is_traced(clean):
+        return clean, np.nan, np.nan
+    # Broadcast axes (all frames alike, no light at all) hold one number each.
+    some = clean if isinstance(clean, jax.Array) else clean[tuple(slice(1 if s == 0 else None) for s in clean.strides)]
+    with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
+        low, high = float(some.min()), float(some.max())
+    if not (low >= 0 and high < np.inf):
+        raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
+    return clean, low, high
+
+
+def checked_exposure(exposure_s):
+    """The exposure in seconds, one number >= 0."""
+    if np.ndim(exposure_s) != 0:
+        raise ValueError(f"exposure_s: expected one number of seconds, got shape {np.shape(exposure_s)}.")
+    if not is_traced(exposure_s) and not 0 <= float(exposure_s) < np.inf:
+        raise ValueError(f"exposure_s: expected finite seconds >= 0, got {exposure_s}.")
+    return exposure_s

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-import hsnoise
+from hsnoise.fit import fit
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
@@ -27,7 +27,7 @@ def fit_with_progress(stack: FrameStack, method: str) -> FitResult:
             if progress.finished:
                 progress.add_task("Fitting", total=None)
 
-        return hsnoise.fit(stack, method=method, progress=tick)
+        return fit(stack, method=method, progress=tick)
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def check_effects(model: NoiseModel, like: FrameStack) -> None:
     white_dn = 2.0**16 if like.white_level is None else float(like.white_level)
     for effect, signal in dark_signals(jax.random.key(0), frames, like.shape, model, exposure_s=exposure_s):
         values = np.asarray(signal, float)
-        unit, largest = ("e-", white_dn / gain) if effect.stage < Stage.GAIN else ("DN", white_dn)
+        unit, largest = ("e-", white_dn / gain) if effect.acts_at < Stage.GAIN else ("DN", white_dn)
         bad = ~np.isfinite(values)
         if bad.any():
             raise ValueError(f"{effect.name}: its sample returned NaN or infinity for {bad.mean():.2g} of the pixels.")

@@ -20,11 +20,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from hsnoise._arguments import checked_exposure, checked_light
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
 from hsnoise._poisson import Regime, regime_of
-from hsnoise._types import RandomKey, Scalar, Window, cfa_tile, channels_of, check_shutter, is_traced
+from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced
 from hsnoise.arrivals import Arrivals, merged
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
 
@@ -67,11 +68,11 @@ class NoiseModel(eqx.Module):
             raise ValueError(f"effects: {', '.join(twice)} given twice; a model holds one effect of a name.")
         check_shutter(shutter)
         channels = channels_of(cfa)
-        ordered = sorted(effects, key=lambda effect: effect.stage)
+        ordered = sorted(effects, key=lambda effect: effect.acts_at)
         self.effects = tuple(_fit_to_channels(effect, channels) for effect in ordered)
         self.cfa = cfa
         self.shutter = shutter
-        self.exposure_s = float(_check_exposure(exposure_s))
+        self.exposure_s = float(checked_exposure(exposure_s))
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -279,11 +280,17 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
     dtype = jnp.result_type(float)
-    clean, low, high = _check_clean(clean, params.cfa)
-    exposure = _check_exposure(params.exposure_s if exposure_s is None else exposure_s)
+    clean, low, high = checked_light(clean, params.cfa)
+    exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
     capture = Capture(
-        jnp.asarray(exposure, dtype), clean.shape[-2:], params.cfa, params.shutter, sensor_key, window=window
+        jnp.asarray(exposure, dtype),
+        clean.shape[-2:],
+        params.cfa,
+        params.shutter,
+        sensor_key,
+        mean_gain=params["gain"].mean(params.cfa, dtype) if "gain" in params else None,
+        window=window,
     )
     effects = merged(params.effects, _regime(low, high, params, exposure))
     # A fit returns float64 parameters, whatever precision the session samples in.
@@ -297,7 +304,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
     """What is known of the mean electrons where light, between `low` and `high`, has not been changed before."""
     rate = params["dark_current"].rate if "dark_current" in params else 0.0
-    changed = any(effect.stage < Stage.PHOTONS for effect in params)
+    changed = any(effect.acts_at < Stage.PHOTONS for effect in params)
     if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
         return "any"
     dark = float(rate) * float(exposure_s)
@@ -350,35 +357,6 @@ def _sample_one(key, signal, shape, effect, capture):
     if isinstance(effect, Arrivals):
         return effect.expose(signal, shape, capture, key=own)
     return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)
-
-
-def _check_clean(clean, cfa: str):
-    """The array, and its lowest and highest value; NaN if it is traced."""
-    clean = clean if isinstance(clean, jax.Array) else np.asarray(clean)
-    if not (jnp.issubdtype(clean.dtype, jnp.integer) or jnp.issubdtype(clean.dtype, jnp.floating)):
-        raise TypeError(f"clean: expected real numbers (photoelectrons), got dtype {clean.dtype}.")
-    if clean.ndim < 2 or clean.size == 0:
-        raise ValueError(f"clean: expected photoelectrons [..., row, column], got shape {clean.shape}.")
-    period = len(cfa_tile(cfa))
-    if clean.shape[-2] % period or clean.shape[-1] % period:
-        raise ValueError(f"clean: expected even rows and columns for cfa {cfa}, got {clean.shape[-2:]}.")
-    if is_traced(clean):
-        return clean, np.nan, np.nan
-    # Broadcast axes (all frames alike, no light at all) hold one number each.
-    some = clean if isinstance(clean, jax.Array) else clean[tuple(slice(1 if s == 0 else None) for s in clean.strides)]
-    with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
-        low, high = float(some.min()), float(some.max())
-    if not (low >= 0 and high < np.inf):
-        raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
-    return clean, low, high
-
-
-def _check_exposure(exposure_s):
-    if np.ndim(exposure_s) != 0:
-        raise ValueError(f"exposure_s: expected one number of seconds, got shape {np.shape(exposure_s)}.")
-    if not is_traced(exposure_s) and not 0 <= float(exposure_s) < np.inf:
-        raise ValueError(f"exposure_s: expected finite seconds >= 0, got {exposure_s}.")
-    return exposure_s
 
 
 def _fit_to_channels(effect: AbstractEffect, channels: tuple[str, ...]) -> AbstractEffect:

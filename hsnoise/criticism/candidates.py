@@ -86,18 +86,23 @@ def given(effect: AbstractEffect) -> Maker:
     return make
 
 
+def _behind(rng: np.random.Generator) -> bool:
+    """Whether an offset arises behind the gain."""
+    return bool(rng.integers(2))
+
+
 def _read_out(s: Scale) -> dict[str, Maker]:
     read = s.read_noise
     return {
-        "row_noise": lambda f, rng: fx.RowNoise(0.25 * f * read, rng.choice([0.0, 1.0])),
-        "column_noise": lambda f, rng: fx.ColumnNoise(0.25 * f * read, rng.choice([0.0, 1.0])),
-        "row_fixed_pattern": lambda f, rng: fx.RowFixedPattern(0.2 * f * read),
-        "column_fixed_pattern": lambda f, rng: fx.ColumnFixedPattern(0.2 * f * read),
-        "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read),
-        "periodic_banding": lambda f, rng: fx.PeriodicBanding(0.3 * f * read, s.line[1], axis=s.line[0]),
+        "row_noise": lambda f, rng: fx.RowNoise(0.25 * f * read, rng.choice([0.0, 1.0]), _behind(rng)),
+        "column_noise": lambda f, rng: fx.ColumnNoise(0.25 * f * read, rng.choice([0.0, 1.0]), _behind(rng)),
+        "row_fixed_pattern": lambda f, rng: fx.RowFixedPattern(0.2 * f * read, _behind(rng)),
+        "column_fixed_pattern": lambda f, rng: fx.ColumnFixedPattern(0.2 * f * read, _behind(rng)),
+        "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read, _behind(rng)),
+        "periodic_banding": lambda f, rng: fx.PeriodicBanding(0.3 * f * read, *s.line[::-1], _behind(rng)),
         "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
         "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * rng.choice([-1, 1]), 0.0),
-        "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, taps=int(rng.choice([2, 4, 8]))),
+        "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, int(rng.choice([2, 4, 8])), _behind(rng)),
         "missing_codes": lambda f, rng: fx.MissingCodes(s.step or 1.0 + min(f, 1.0) * rng.uniform(0.1, 1.5)),
     }
 
@@ -107,7 +112,7 @@ def _pixels(s: Scale, shutter: str) -> dict[str, Maker]:
     exponents = [0.0] if shutter == "global" else [0.0, 1.0]
     return {
         "shared_row_gain": lambda f, rng: fx.SharedRowGain(0.1 * f, rng.choice(exponents)),
-        "dark_signal_nonuniformity": lambda f, rng: fx.DarkSignalNonuniformity(0.35 * f * read),
+        "dark_signal_nonuniformity": lambda f, rng: fx.DarkSignalNonuniformity(0.35 * f * read, _behind(rng)),
         "random_telegraph_noise": lambda f, rng: fx.RandomTelegraphNoise(
             0.02 * f, rng.uniform(2.5, 6.0) * read, rng.uniform(0.15, 0.85)
         ),

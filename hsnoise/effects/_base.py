@@ -128,6 +128,7 @@ class Capture(eqx.Module):
         cfa: "mono" or a 2x2 Bayer string.
         shutter: "rolling" or "global".
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
+        mean_gain: system gain of the pixels on average, DN/e-; None if the model has no gain.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
         differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
@@ -139,6 +140,7 @@ class Capture(eqx.Module):
     shutter: str = eqx.field(static=True)
     sensor_key: RandomKey
     read_noise_scale: Frames | PixelMap | None = None
+    mean_gain: Scalar | None = None
     differentiable: bool = eqx.field(static=True, default=False)
     window: Window | None = eqx.field(static=True, default=None)
 
@@ -161,6 +163,10 @@ class Capture(eqx.Module):
         """The nearest whole numbers; their derivative is that of the signal if it is wanted."""
         whole = jnp.round(signal)
         return signal + jax.lax.stop_gradient(whole - signal) if self.differentiable else whole
+
+    def offset(self, electrons: jax.Array, after_gain: bool) -> jax.Array:
+        """An offset in the unit of the signal: e-, or behind the gain DN, as many as the electrons give on average."""
+        return electrons * self.mean_gain if after_gain and self.mean_gain is not None else electrons
 
     def fixed_key(self, name: str) -> RandomKey:
         """The key from which the effect called `name` draws what never changes on this sensor."""
@@ -209,6 +215,11 @@ class AbstractEffect(eqx.Module):
     in_series: ClassVar[bool] = False
     adds: ClassVar[bool] = False
     stream: ClassVar[str] = ""
+
+    @property
+    def acts_at(self) -> Stage:
+        """Its stage, or behind the gain if it has a setting `after_gain` that says so."""
+        return Stage.BLACK if getattr(self, "after_gain", False) else self.stage
 
     @abc.abstractmethod
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:

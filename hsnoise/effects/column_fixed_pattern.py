@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 
 from hsnoise._types import Frames, RandomKey, Scalar
@@ -17,14 +18,18 @@ class ColumnFixedPattern(AbstractEffect):
 
     In dark frames: vertical streaks that stay when frames are averaged.
 
+    Attributes:
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+
     Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU of columns).
     """
 
     name: ClassVar[str] = "column_fixed_pattern"
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         _, _, columns = signal.shape
         pattern = jax.random.normal(capture.fixed_key(self.name), (1, 1, columns), signal.dtype)
-        return signal + self.sigma * pattern
+        return signal + capture.offset(self.sigma * pattern, self.after_gain)

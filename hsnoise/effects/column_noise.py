@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from hsnoise._types import Frames, RandomKey, Scalar
@@ -19,6 +20,9 @@ class ColumnNoise(AbstractEffect):
 
     In dark frames: vertical streaks that change from frame to frame, equally strong in all colours and exposures.
 
+    Attributes:
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
 
@@ -26,8 +30,9 @@ class ColumnNoise(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
     exponent: Scalar = param("1", default=0.0, doc="power falls as column frequency to minus this: 0 white, 1 is 1/f")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, _, columns = signal.shape
         series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype)
-        return signal + self.sigma * jnp.swapaxes(series, 1, 2)
+        return signal + capture.offset(self.sigma * jnp.swapaxes(series, 1, 2), self.after_gain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 
 from hsnoise._types import Frames, RandomKey, Scalar
@@ -17,13 +18,17 @@ class DarkSignalNonuniformity(AbstractEffect):
 
     In dark frames: a grain that stays when frames are averaged, equally strong in all exposures.
 
+    Attributes:
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+
     Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU).
     """
 
     name: ClassVar[str] = "dark_signal_nonuniformity"
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over pixels")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         pattern = jax.random.normal(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
-        return signal + self.sigma * pattern
+        return signal + capture.offset(self.sigma * pattern, self.after_gain)

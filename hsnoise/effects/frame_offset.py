@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 
 from hsnoise._types import Frames, RandomKey, Scalar
@@ -17,12 +18,17 @@ class FrameOffset(AbstractEffect):
 
     In dark frames: the mean of frames scatters by more than the noise of their pixels allows, in all colours alike.
 
+    Attributes:
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
 
     name: ClassVar[str] = "frame_offset"
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over frames")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return signal + self.sigma * jax.random.normal(key, (len(signal), 1, 1), signal.dtype)
+        offset = self.sigma * jax.random.normal(key, (len(signal), 1, 1), signal.dtype)
+        return signal + capture.offset(offset, self.after_gain)

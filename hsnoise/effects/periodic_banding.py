@@ -24,6 +24,7 @@ class PeriodicBanding(AbstractEffect):
 
     Attributes:
         axis: "row" for a sinusoid over rows (horizontal bands), "column" for one over columns.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (pick-up noise).
     """
@@ -33,6 +34,7 @@ class PeriodicBanding(AbstractEffect):
     amplitude: Scalar = param("e-", low=0, doc="amplitude of the sinusoid")
     frequency: Scalar = param("cycles/pixel", low=0, high=0.5, held=True, doc="cycles per row, or column; fits hold it")
     axis: str = eqx.field(static=True, default="row")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         if self.axis not in ("row", "column"):
@@ -43,4 +45,5 @@ class PeriodicBanding(AbstractEffect):
         shape = (1, rows, 1) if self.axis == "row" else (1, 1, columns)
         i = jnp.arange(max(shape), dtype=signal.dtype).reshape(shape)
         phase = jax.random.uniform(key, (frames, 1, 1), signal.dtype, maxval=2 * np.pi)
-        return signal + self.amplitude * jnp.sin(2 * np.pi * self.frequency * i + phase)
+        wave = self.amplitude * jnp.sin(2 * np.pi * self.frequency * i + phase)
+        return signal + capture.offset(wave, self.after_gain)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import equinox as eqx
+
 from hsnoise._types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
 
@@ -18,6 +20,9 @@ class RowNoise(AbstractEffect):
 
     In dark frames: horizontal streaks that change from frame to frame, equally strong in all colours and exposures.
 
+    Attributes:
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
 
@@ -25,7 +30,9 @@ class RowNoise(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over rows")
     exponent: Scalar = param("1", default=0.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        return signal + self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)
+        offset = self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)
+        return signal + capture.offset(offset, self.after_gain)

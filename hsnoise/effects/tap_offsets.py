@@ -21,6 +21,7 @@ class TapOffsets(AbstractEffect):
 
     Attributes:
         taps: number of outputs, at least 2.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (nonuniformity of columns).
     """
@@ -29,6 +30,7 @@ class TapOffsets(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     sigma: Scalar = param("e-", low=0, doc="standard deviation over taps")
     taps: int = eqx.field(static=True, default=4)
+    after_gain: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         if not isinstance(self.taps, int) or self.taps < 2:
@@ -37,4 +39,4 @@ class TapOffsets(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         tap = capture.columns * self.taps // capture.sensor_shape[1]
         offsets = jax.random.normal(capture.fixed_key(self.name), (self.taps,), signal.dtype)
-        return signal + self.sigma * offsets[tap][None, None]
+        return signal + capture.offset(self.sigma * offsets[tap][None, None], self.after_gain)

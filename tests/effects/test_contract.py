@@ -143,6 +143,21 @@ def test_frames_depend_on_those_before_only_in_series(effect):
         assert not np.array_equal(draws[0][1], draws[1][1])
 
 
+@pytest.mark.parametrize("effect", [e for e in EXAMPLES if hasattr(e, "after_gain")], ids=lambda effect: effect.name)
+def test_an_offset_behind_the_gain_is_alike_in_all_colours(effect):
+    gain, rows = [1.5, 1.2, 1.3], RowGain([0.4, 0.2, 0.1], 1.0)
+    behind = type(effect)(
+        **{name: getattr(effect, name) for name in effect.specs()}, **{**effect.settings(), "after_gain": True}
+    )
+    models = [
+        NoiseModel(effects, cfa="RGGB", shutter="rolling", exposure_s=0.1)
+        for effects in ([effect], [behind, rows, Gain(gain)])
+    ]
+    electrons, counts = (np.asarray(sample(KEY, 0.0 * signal(), model)) for model in models)
+    assert np.ptp(electrons) > 0
+    np.testing.assert_allclose(counts, electrons * np.mean([1.5, 1.2, 1.2, 1.3]), rtol=1e-6, atol=1e-9)
+
+
 @each_effect
 def test_effect_is_final(effect):
     assert type(effect).__mro__[1] is AbstractEffect
