@@ -278,6 +278,7 @@ def test_bad_arguments_are_refused(change, message):
         hsnoise.fit(stack, **change)
 
 
+@pytest.mark.slow
 def test_wrong_exposures_are_told():
     model = hsnoise.cameras.grasshopper3(black_level_dn=64)
     right = capture(model)
