@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hsnoise.criticism.fingerprint import Bench
-from hsnoise.criticism.gaussian import shrunk
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
@@ -16,8 +18,10 @@ CLAMP = BlackClamp.name
 DRAWS = 40
 
 
-def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> Candidate | None:
-    """The capture refitted with a clamp; None if that is no better, or cannot be done.
+def clamp_by_likelihood(
+    fitted: FitResult, bench: Bench, evidence: Evidence
+) -> tuple[Candidate, Evidence, Gaussian] | None:
+    """The capture refitted with a clamp: candidate, evidence and law with it; None if no better, or not to be done.
 
     It can be done for a maximum-likelihood fit of darks at several exposures, without other effects in the model.
     """
@@ -38,4 +42,5 @@ def clamp_by_likelihood(fitted: FitResult, bench: Bench, evidence: Evidence) -> 
     law = shrunk(own.own_z(), np.zeros((1, len(own.mean))))
     z = own.z(measure(bench.part, clamped.params).values)
     misfit = max(law.normal_scores(z, own.groups).values())
-    return Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)
+    candidate = Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)
+    return candidate, replace(evidence, z=z), law

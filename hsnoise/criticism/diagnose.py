@@ -179,8 +179,11 @@ def diagnose(
     if found.verdict == "unexplained" or CLAMP in [c.name for c in ranking[:2] if c.score > EVIDENCE]:
         clamp = clamp_by_likelihood(fit, bench, evidence)
         if clamp is not None:
+            candidate, left, law = clamp
             others = [c for c in ranking if c.name != CLAMP]
-            found = _verdict(sorted([clamp, *others], key=lambda c: -c.score), None, evidence, laws)
+            found = _verdict(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, laws)
+            if found.best is candidate:
+                found = replace(found, unexplained=_what_remains(left, law))
     return found
 
 
