@@ -283,22 +283,23 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     clean, low, high = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
+    effects = merged(params.effects, _regime(low, high, params, exposure))
+    # A fit returns float64 parameters, whatever precision the session samples in.
+    numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
+    numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
+    effects = eqx.combine(numbers, rest)
     capture = Capture(
         jnp.asarray(exposure, dtype),
         clean.shape[-2:],
         params.cfa,
         params.shutter,
         sensor_key,
-        mean_gain=params["gain"].mean(params.cfa, dtype) if "gain" in params else None,
+        gain=next((effect.value for effect in effects if effect.name == "gain"), None),
         window=window,
     )
-    effects = merged(params.effects, _regime(low, high, params, exposure))
-    # A fit returns float64 parameters, whatever precision the session samples in.
-    numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
-    numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
     shape = (math.prod(clean.shape[:-2]), *capture.shape)
     light = jnp.asarray(low, dtype) if low == high else jnp.asarray(clean, dtype).reshape(shape)
-    return light, shape, eqx.combine(numbers, rest), capture
+    return light, shape, effects, capture
 
 
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:

@@ -274,11 +274,11 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
             covariance, gain = np.linalg.inv(information), slopes.T @ weight
             by, taken = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance))), taken + 1
             fresh = True
-        slope = gain @ ((measured - here.drawn.mean(0)) / scale) - prior * (here.y - problem.start)
-        length = float(np.abs(covariance @ slope / np.sqrt(np.diagonal(covariance))).max())
+        uphill = gain @ ((measured - here.drawn.mean(0)) / scale) - prior * (here.y - problem.start)
+        length = float(np.abs(covariance @ uphill / np.sqrt(np.diagonal(covariance))).max())
         if not np.isfinite(length):
             raise RuntimeError(_not_finite(problem, here.y))
-        step = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), slope)
+        step = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), uphill)
         ahead = here.y + step * problem.share_of(step)
         if length < SHORT_STEP:
             here = replace(here, y=ahead)

@@ -128,7 +128,7 @@ class Capture(eqx.Module):
         cfa: "mono" or a 2x2 Bayer string.
         shutter: "rolling" or "global".
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
-        mean_gain: system gain of the pixels on average, DN/e-; None if the model has no gain.
+        gain: system gain [channel], DN/e-; None if the model has none.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
         differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
@@ -140,7 +140,7 @@ class Capture(eqx.Module):
     shutter: str = eqx.field(static=True)
     sensor_key: RandomKey
     read_noise_scale: Frames | PixelMap | None = None
-    mean_gain: Scalar | None = None
+    gain: PerChannel | None = None
     differentiable: bool = eqx.field(static=True, default=False)
     window: Window | None = eqx.field(static=True, default=None)
 
@@ -166,7 +166,9 @@ class Capture(eqx.Module):
 
     def offset(self, electrons: jax.Array, after_gain: bool) -> jax.Array:
         """An offset in the unit of the signal: e-, or behind the gain DN, as many as the electrons give on average."""
-        return electrons * self.mean_gain if after_gain and self.mean_gain is not None else electrons
+        if not after_gain or self.gain is None:
+            return electrons
+        return electrons * jnp.mean(self.gain[cfa_tile(self.cfa).ravel()])
 
     def fixed_key(self, name: str) -> RandomKey:
         """The key from which the effect called `name` draws what never changes on this sensor."""
@@ -234,6 +236,9 @@ class AbstractEffect(eqx.Module):
         return None
 
     def __check_init__(self):
+        after_gain = getattr(self, "after_gain", False)
+        if not isinstance(after_gain, bool):
+            raise ValueError(f"{self.name}.after_gain: expected True or False, got {after_gain!r}.")
         for field, spec in self.specs().items():
             value = getattr(self, field)
             if is_traced(value):

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
-
-from hsnoise._types import Frames, PerChannel, RandomKey, Scalar, cfa_tile
+from hsnoise._types import Frames, PerChannel, RandomKey
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 
@@ -23,9 +20,3 @@ class Gain(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return signal * capture.per_pixel(self.value)
-
-    def mean(self, cfa: str, dtype: jnp.dtype) -> Scalar:
-        """Gain of the pixels on average, DN/e-."""
-        tile = cfa_tile(cfa)
-        values = jax.lax.convert_element_type(jnp.broadcast_to(self.value, tile.max() + 1), dtype)
-        return jnp.mean(values[tile.ravel()])

@@ -156,6 +156,8 @@ def test_an_offset_behind_the_gain_is_alike_in_all_colours(effect):
     electrons, counts = (np.asarray(sample(KEY, 0.0 * signal(), model)) for model in models)
     assert np.ptp(electrons) > 0
     np.testing.assert_allclose(counts, electrons * np.mean([1.5, 1.2, 1.2, 1.3]), rtol=1e-6, atol=1e-9)
+    with pytest.raises(ValueError, match=rf"{effect.name}\.after_gain: expected True or False, got 'no'"):
+        type(effect)(**{name: getattr(effect, name) for name in effect.specs()}, after_gain="no")
 
 
 @each_effect
