@@ -38,7 +38,7 @@ class Structure:
 
 SHORT = "short exposures"
 WORDS = {
-    SHORT: "short and long exposures: means over the shorter and the longer half of the exposure times",
+    " exposures": "short and long exposures: means over the shorter and the longer half of the exposure times",
     " in band ": "bands: ranges of frequency over the rows or columns of a frame, from slow to fast",
     "row x frame": "row x frame, column x frame: means of rows or columns that are new in each frame",
     "static map": "static map: mean over the frames, what stays in place",
