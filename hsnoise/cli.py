@@ -141,7 +141,7 @@ def _compare(args: argparse.Namespace) -> None:
     check_fits(model, stack)
     args.out.mkdir(parents=True, exist_ok=True)
     with busy("Drawing from the model") as say:
-        found = hsnoise.compare(model, stack, seed=args.seed, progress=counter(say, "Captures drawn from the model"))
+        found = hsnoise.compare(model, stack, seed=args.seed, progress=counter(say, "Drawing from the model"))
     _show(found, args.out / "comparison.png")
     _write_report(args, found, stack, fit=model)
 
@@ -152,7 +152,7 @@ def _diagnose(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
     with busy("Drawing every effect that may be missing") as say:
-        tick = counter(say, "Captures drawn with effects that may be missing")
+        tick = counter(say, "Drawing every effect that may be missing")
         found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=tick)
     _show(found, args.out / "ranking.png")
     if args.report is not None:

@@ -86,9 +86,14 @@ class Parameter:
     spec: ParameterSpec
 
 
-def _as_leaf(x) -> jax.Array:
+def _as_leaf(x):
     # An array keeps its own precision: a fit hands over float64 whatever the session uses.
-    return x if eqx.is_inexact_array(x) and isinstance(x, jax.Array) else jnp.asarray(x, float)
+    if eqx.is_inexact_array(x) and isinstance(x, jax.Array):
+        return x
+    try:
+        return jnp.asarray(x, float)
+    except (TypeError, ValueError):
+        return x  # no number: `__check_init__`, which knows the parameter's name, says so
 
 
 def param(
@@ -243,6 +248,9 @@ class AbstractEffect(eqx.Module):
             value = getattr(self, field)
             if is_traced(value):
                 continue
+            if not isinstance(value, jax.Array):
+                expected = "a number or one for each channel" if spec.per_channel else "a number"
+                raise TypeError(f"{self.name}.{field}: expected {expected}, got {value!r}.")
             low = -np.inf if spec.low is None else spec.low
             high = np.inf if spec.high is None else spec.high
             value = np.asarray(value)

@@ -189,6 +189,18 @@ def test_a_capture_of_one_exposure_is_offered_no_clamp():
     assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
 
 
+@pytest.mark.slow
+def test_what_a_clamp_leaves_is_told_by_its_refit():
+    """Against the model without it, the statistics of a clamped capture are far off in many groups."""
+    whole = np.asarray(MODEL["gain"].value) * float(MODEL["dark_current"].rate)
+    stack = draw_capture(5, MODEL.add(fx.BlackClamp(whole)), empty_stack(frames=8))
+    fit = hsnoise.fit(stack)
+    found = hsnoise.diagnose(fit, stack)
+    assert hsnoise.compare(fit.params, stack).error > 5
+    assert found.verdict == "ambiguous" and found.names == ("black_clamp", "gain")
+    assert found.unexplained.misfit < 3.5 and not found.unexplained.statistics
+
+
 def test_shrunk_law_is_that_of_its_draws():
     rng = np.random.default_rng(3)
     z = rng.standard_normal((4000, 6)) @ np.linalg.cholesky(0.5 * np.eye(6) + 0.5).T

@@ -161,6 +161,14 @@ def test_an_offset_behind_the_gain_is_alike_in_all_colours(effect):
 
 
 @each_effect
+def test_a_parameter_that_is_no_number_is_named(effect):
+    for name in effect.specs():
+        values = {field: getattr(effect, field) for field in effect.specs()}
+        with pytest.raises(TypeError, match=rf"{effect.name}\.{name}: expected a number.* got 'loud'"):
+            type(effect)(**{**values, name: "loud"}, **effect.settings())
+
+
+@each_effect
 def test_effect_is_final(effect):
     assert type(effect).__mro__[1] is AbstractEffect
     assert not inspect.isabstract(type(effect))
