@@ -22,6 +22,7 @@ CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many 
 # Taken for a standard error of every coordinate before one is known: at most this, and this over the root of pixels.
 FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
 MANY_ROWS, PILOT_ROWS = 30_000, 3_000
+FAR_OFF = 1e12  # loss where a step must not end
 CHORDS, PIECE_MARGIN = 12, 1.1
 CHORD_CLOSE_SIGMA = 0.1  # with the curvature of a part of the frames
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
@@ -80,9 +81,9 @@ def _n_rows(summary: Summary) -> int:
 
 def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
     """Rounds of quasi-Newton steps, each from a fresh curvature and with fresh quadrature rules."""
-    light = without_counts(summary)
+    light = _on_device(without_counts(summary))
     vector = eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base)
-    rules = plan_rules(coordinates.base, summary)
+    rules = _on_device(plan_rules(coordinates.base, summary))
     pixels = sum(h.counts.sum(dtype=np.float64) for h in summary.histograms) + 1.0
     whiten = min(FIRST_SPREAD, FIRST_SPREAD_OF_ONE / np.sqrt(pixels)) * np.eye(len(vector))
     value, gradient, whiten = _curvature(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
@@ -93,7 +94,7 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
         if not np.isfinite(ahead).all():
             distance = np.inf
             break
-        rules = replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary))
+        rules = _on_device(replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary)))
         value, gradient, whiten = _curvature(coordinates, ahead, whiten, partial(_gradients, coordinates, light, rules))
         # Length in standard errors of the Newton step that is left.
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
@@ -104,6 +105,10 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
             break
     information = _in_parameters(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
     return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
+
+
+def _on_device(tree):
+    return jax.tree.map(jnp.asarray, tree)  # once, not with every gradient
 
 
 def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
@@ -155,40 +160,59 @@ def _prior_at(coordinates, vector):
     return jax.value_and_grad(coordinates.log_prior)(vector)
 
 
-def _objective(coordinates: Coordinates, vector, summary: Summary, rules: Rules):
-    return evaluate(coordinates.physics(vector), summary, rules) + coordinates.log_prior(vector)
-
-
-@eqx.filter_jit
 def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
-    """BFGS in coordinates whose unit is about one standard error, so that its first step is Newton's.
+    """BFGS in coordinates whose unit is about one standard error, so that its first step is Newton's: (vector, steps).
 
-    It moves in the space that the columns of `whiten` span, less than `reach` from `vector`.
+    It moves in the space that the columns of `whiten` span, less than `reach` from `vector`. The gradient is that of
+    `gradient_at`, compiled once for all that needs it; only the step of the solver is a program of its own.
     """
     import optimistix as optx  # a seventh of the time that `import hsnoise` would take
 
-    def loss(y, _):
-        ahead = vector + whiten @ y
-        loss = reference - _objective(coordinates, ahead, summary, rules)
-        return jnp.where(jnp.isfinite(loss) & (jnp.abs(ahead - vector) < reach).all(), loss, 1e12)
-
     solver = optx.BFGS(rtol=0.0, atol=1e-2, norm=optx.max_norm)
-    solution = optx.minimise(loss, solver, jnp.zeros(whiten.shape[1]), max_steps=STEPS, throw=False)
-    return vector + whiten @ solution.value, solution.stats["num_steps"]
+    y = jnp.zeros(whiten.shape[1])
+    state = _begin(solver, y)
+    for steps in range(1, STEPS + 1):
+        ahead = vector + whiten @ state.y_eval
+        value, gradient = gradient_at(coordinates, ahead, summary, rules)
+        fair = np.isfinite(value) & (np.abs(ahead - vector) < reach).all()
+        told = (reference - value, -(whiten.T @ gradient)) if fair else (FAR_OFF, jnp.zeros_like(y))
+        y, state, done = _step(solver, y, told, state)
+        if done:
+            break
+    return vector + whiten @ y, steps
+
+
+def _told(y, told):
+    """The function of which value and slope at `y` were told."""
+    value, slope = told
+    return value + slope @ (y - jax.lax.stop_gradient(y)), None
+
+
+@eqx.filter_jit
+def _begin(solver, y):
+    return solver.init(_told, y, None, {}, jax.ShapeDtypeStruct((), y.dtype), None, frozenset())
+
+
+@eqx.filter_jit
+def _step(solver, y, told, state):
+    y, state, _ = solver.step(_told, y, told, {}, state, frozenset())
+    done, _ = solver.terminate(_told, y, told, {}, state, frozenset())
+    return y, state, done
 
 
 @eqx.filter_jit
 def gradient_at(coordinates, vector, summary, rules):
-    return jax.value_and_grad(partial(_at, coordinates, summary, rules))(vector)
+    """Log-likelihood plus prior, and its gradient."""
+    return jax.value_and_grad(lambda at: evaluate(coordinates.physics(at), summary, rules) + coordinates.log_prior(at))(
+        vector
+    )
 
 
-@eqx.filter_jit
 def _gradients(coordinates, summary, rules, points):
-    return jax.lax.map(jax.value_and_grad(partial(_at, coordinates, summary, rules)), points)
-
-
-def _at(coordinates, summary, rules, vector):
-    return _objective(coordinates, vector, summary, rules)
+    """Values and gradients at `points`, one after the other."""
+    found = [gradient_at(coordinates, point, summary, rules) for point in jnp.asarray(points)]
+    values, gradients = zip(*found, strict=True)
+    return np.asarray(values), np.asarray(gradients)
 
 
 @eqx.filter_jit

@@ -53,6 +53,7 @@ LEGEND = (
 NEXT = "next: hsnoise improve, or in Python hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
+LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ def diagnose(
     ranking = [one.candidate(evidence) for one in judged]
     laws = {one.of.name: one.of.law(one.amplitude, evidence.null) for one in judged}
     found = _verdict(ranking, pair, evidence, laws)
-    if found.verdict == "unexplained" or CLAMP in [c.name for c in ranking[:2] if c.score > EVIDENCE]:
+    if _may_be_a_clamp(found, bench, evidence):
         clamp = clamp_by_likelihood(fit, bench, evidence)
         if clamp is not None:
             candidate, left, law = clamp
@@ -185,6 +186,17 @@ def diagnose(
             if found.best is candidate:
                 found = replace(found, unexplained=_what_remains(left, law))
     return found
+
+
+def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:
+    """Whether it is worth a second fit. A clamp of which nothing is known leads the fit to another gain, dark current
+    and read noise, so far off that draws from there tell of it badly, or not at all: "nothing missing".
+    """
+    if found.verdict == "nothing missing":
+        as_fitted = shrunk(bench.base.own_z(), np.zeros((1, len(evidence.z))))
+        return evidence.misfit(as_fitted) > MISFIT
+    leaders = [c.name for c in found.ranking[:2] if c.score > EVIDENCE]
+    return found.verdict == "unexplained" or not LIKE_A_CLAMP.isdisjoint(leaders)
 
 
 def _best_first(judged: Iterable[Judged]) -> list[Judged]:
