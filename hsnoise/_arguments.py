@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -53,6 +53,22 @@ def whole_number(name: str, value: Any, least: int | None = None) -> int:
     if least is not None and number < least:
         raise ValueError(f"{name}: expected at least {least}, got {value}")
     return number
+
+
+def callback(name: str, function: Any) -> Callable[..., Any]:
+    """A user's function, or for None one that does nothing. Raises TypeError for what cannot be called."""
+    if function is not None and not callable(function):
+        raise TypeError(f"{name}: expected a function or None, got {function!r}")
+    return function or (lambda *told: None)
+
+
+def check_key(name: str, key: Any) -> None:
+    """Raise TypeError unless `key` is one random key, of the new style or the old."""
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    if not (new or (dtype == np.uint32 and shape is not None and len(shape) == 1)):
+        came = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
+        raise TypeError(f"{name}: expected one random key, such as jax.random.key(0), got {came}")
 
 
 def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:

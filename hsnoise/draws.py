@@ -55,17 +55,17 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     return part.with_counts(counts, window)
 
 
-def check_fits(model: NoiseModel, stack: FrameStack) -> None:
-    """Raise TypeError or ValueError unless `model` can describe the sensor of `stack`."""
+def check_fits(model: NoiseModel, stack: FrameStack, name: str = "params") -> None:
+    """Raise TypeError or ValueError, naming the argument, unless `model` can describe the sensor of `stack`."""
     if not isinstance(model, NoiseModel):
-        raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
+        raise TypeError(f"{name}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
     if (model.cfa, model.shutter) != (stack.cfa, stack.shutter):
         raise ValueError(
-            f"params: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
+            f"{name}: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
             " files do not say so, give it cfa= and shutter=)"
         )
     if "adc" not in model:
-        raise ValueError("params: expected a model with the effect adc, which makes counts (DN)")
+        raise ValueError(f"{name}: expected a model with the effect adc, which makes counts (DN)")
 
 
 def check_effects(model: NoiseModel, like: FrameStack) -> None:
@@ -82,7 +82,9 @@ def check_effects(model: NoiseModel, like: FrameStack) -> None:
         unit, largest = ("e-", white_dn / gain) if effect.acts_at < Stage.GAIN else ("DN", white_dn)
         bad = ~np.isfinite(values)
         if bad.any():
-            raise ValueError(f"{effect.name}: its sample returned NaN or infinity for {bad.mean():.2g} of the pixels.")
+            raise ValueError(
+                f"{effect.name}: its sample returned NaN or infinity in {100 * bad.mean():.2g} % of the pixels."
+            )
         typical = float(np.sqrt(np.mean(values**2)))
         if typical > MOST_RANGES * largest:
             raise ValueError(

@@ -133,7 +133,7 @@ def _check_model(model: NoiseModel) -> bool:
     """Whether it has a row gain. Raises ValueError for a model that cannot be fitted."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
-        raise ValueError(f"model: fit needs the effects {', '.join(missing)}")
+        raise ValueError(f"model: has no {', '.join(missing)}, without which it cannot be fitted")
     with jax.enable_x64(True):
         physics_of(model)  # raises for effects without a likelihood
     return "row_gain" in model

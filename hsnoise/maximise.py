@@ -170,15 +170,14 @@ def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
 
     solver = optx.BFGS(rtol=0.0, atol=1e-2, norm=optx.max_norm)
     y = jnp.zeros(whiten.shape[1])
-    state = _begin(solver, y)
-    for steps in range(1, STEPS + 1):
+    state, steps, done = _begin(solver, y), 0, False
+    while not done and steps < STEPS:
         ahead = vector + whiten @ state.y_eval
         value, gradient = gradient_at(coordinates, ahead, summary, rules)
         fair = np.isfinite(value) & (np.abs(ahead - vector) < reach).all()
         told = (reference - value, -(whiten.T @ gradient)) if fair else (FAR_OFF, jnp.zeros_like(y))
         y, state, done = _step(solver, y, told, state)
-        if done:
-            break
+        steps += 1
     return vector + whiten @ y, steps
 
 

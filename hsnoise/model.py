@@ -20,7 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise._arguments import checked_exposure, checked_light
+from hsnoise._arguments import check_key, checked_exposure, checked_light
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
@@ -108,10 +108,13 @@ class NoiseModel(eqx.Module):
     def with_value(self, name: str, field: str, value: ArrayLike) -> NoiseModel:
         """The model with another value of one parameter, such as `model.with_value("gain", "value", 2.0)`.
 
-        Raises KeyError for an effect that it has not, ValueError for a value that does not fit the channels.
+        Raises KeyError for an effect that it has not, ValueError for a parameter that the effect has not, and for a
+        value outside its bounds or that does not fit the channels, TypeError for what is no number.
         """
         old = self[name]
-        new = eqx.tree_at(attrgetter(field), old, jnp.asarray(value, float))
+        if field not in old.specs():
+            raise ValueError(f"field: expected a parameter of {name} ({', '.join(old.specs())}), got {field!r}")
+        new = dataclasses.replace(old, **{field: value})
         return self._with(new if effect is old else effect for effect in self.effects)
 
     def _with(self, effects: Iterable[AbstractEffect]) -> NoiseModel:
@@ -223,7 +226,7 @@ def sample(
         Without the `adc` effect (`params.remove("adc")`): DN as floats, neither rounded nor clipped.
 
     Raises:
-        TypeError: if `params` is no NoiseModel or `clean` does not hold real numbers.
+        TypeError: if `params` is no NoiseModel, `key` no random key, or `clean` does not hold real numbers.
         ValueError: if `clean` has fewer than two dimensions, no pixels, odd sizes with a Bayer array, or
             negative or non-finite values; if the exposure is negative or not one number. (Under jit, values
             cannot be checked.)
@@ -279,6 +282,9 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     """Checked input: photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
+    check_key("key", key)
+    if sensor_key is not None:
+        check_key("sensor_key", sensor_key)
     dtype = jnp.result_type(float)
     clean, low, high = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)

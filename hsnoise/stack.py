@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -336,7 +337,7 @@ def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
     """A `FrameStack` as it is, or one made of a bare array with the keywords of `FrameStack`.
 
     Raises:
-        TypeError: keywords beside a `FrameStack`, which holds them already; or a path.
+        TypeError: keywords beside a `FrameStack`, which holds them already, or that it does not know; or a path.
     """
     if isinstance(array_or_stack, FrameStack):
         if keywords:
@@ -350,4 +351,8 @@ def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
         )
     if not hasattr(array_or_stack, "__len__") and not hasattr(array_or_stack, "shape"):
         raise TypeError(f"stack: expected a FrameStack or an array of counts, got {type(array_or_stack).__name__}")
+    known = [name for name in inspect.signature(FrameStack).parameters if name != "counts"]
+    unknown = [name for name in keywords if name not in known]
+    if unknown:
+        raise TypeError(f"{', '.join(unknown)}: expected keywords among {', '.join(known)}")
     return FrameStack(array_or_stack, **keywords)

@@ -13,6 +13,7 @@ from functools import partial, reduce
 import equinox as eqx
 import numpy as np
 
+from hsnoise._arguments import callback
 from hsnoise._frames import channel_planes
 from hsnoise._threads import in_threads
 from hsnoise._types import channels_of
@@ -164,7 +165,7 @@ def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) ->
     Raises ValueError for frames that cannot be measured (NaN, constant, all zero, saturated) and where nothing is left
     to fit.
     """
-    tick = progress or (lambda: None)
+    tick = callback("progress", progress)
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
     flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
     return Summary(

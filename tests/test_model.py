@@ -340,3 +340,29 @@ def test_wrong_models_are_refused():
         canon_5d3(cfa="RGB")
     with pytest.raises(ValueError, match="shutter: expected"):
         canon_5d3(shutter="slow")
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "error", "message"),
+    [
+        ("gain", "value", -1.0, ValueError, r"gain\.value: expected finite values in \[0"),
+        ("gain", "value", np.nan, ValueError, r"gain\.value: expected finite"),
+        ("gain", "value", [1.0, 2.0], ValueError, r"gain\.value: expected a scalar or one value per channel"),
+        ("read_noise", "sigma", "loud", TypeError, r"read_noise\.sigma: expected a number"),
+        ("read_noise", "sigmaa", 1.0, ValueError, r"field: expected a parameter of read_noise \(sigma\)"),
+        ("row_noise", "sigma", 1.0, KeyError, "row_noise"),
+    ],
+)
+def test_a_value_that_a_parameter_cannot_have_is_refused(name, field, value, error, message):
+    with pytest.raises(error, match=message):
+        canon_5d3().with_value(name, field, value)
+
+
+@pytest.mark.parametrize(
+    "key", [0, "0", np.zeros(2), jax.random.split(jax.random.key(0), 3)], ids=["number", "text", "floats", "several"]
+)
+@pytest.mark.parametrize("name", ["key", "sensor_key"])
+def test_what_is_no_random_key_is_named(name, key):
+    keys = {"key": jax.random.key(0), "sensor_key": jax.random.key(1), name: key}
+    with pytest.raises(TypeError, match=f"^{name}: expected one random key"):
+        sample(keys["key"], np.zeros((1, 4, 4)), canon_5d3(), sensor_key=keys["sensor_key"])

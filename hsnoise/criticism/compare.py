@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import whole_number
+from hsnoise._arguments import callback, whole_number
 from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
@@ -83,7 +83,8 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     Raises:
         TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
     """
-    draws, seed = whole_number("draws", draws, 8), whole_number("seed", seed)
+    draws, seed = whole_number("draws", draws, 8), whole_number("seed", seed, 0)
+    tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
     part = part_of(stack)
@@ -91,7 +92,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     measured = measure(part, params)
     own, per_pixel = in_threads(  # the likelihood is compiled while captures are drawn
         lambda work: work(),
-        [lambda: reference(params, part, draws, seed, progress or (lambda: None)), lambda: _per_pixel(params, part)],
+        [lambda: reference(params, part, draws, seed, tick), lambda: _per_pixel(params, part)],
     )
     z = own.z(measured.values)
     groups = misfits(z, own.groups)

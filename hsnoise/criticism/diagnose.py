@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import whole_number
+from hsnoise._arguments import callback, whole_number
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
@@ -150,13 +150,13 @@ def diagnose(
         TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, is in the model, or
             returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
-    tick = progress or (lambda: None)
-    draws, seed = whole_number("draws", draws, MANY_DETAILS), whole_number("seed", seed)
+    tick = callback("progress", progress)
+    draws, seed = whole_number("draws", draws, MANY_DETAILS), whole_number("seed", seed, 0)
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
         raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
-    check_fits(model, stack)
+    check_fits(model, stack, "fit")
     own = {effect.name: given(effect) for effect in not_in(model, check_candidates(candidates))}
     part = part_of(stack)
     check_effects(model, part)

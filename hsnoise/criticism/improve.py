@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._arguments import callback, whole_number
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.gaussian import shrunk
@@ -19,7 +20,7 @@ from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import WITH_LIKELIHOOD, fit
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult
+from hsnoise.result import FitResult, rounded
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
@@ -102,6 +103,8 @@ class Story:
                     f" -> {step.comparison.error:.2f}.",
                     highlight=False,
                 )
+                for sentence in _size(step.fit, step.added):
+                    console.print(f"  {sentence}", highlight=False)
             for sentence in step.moved:
                 console.print(f"  {sentence}", highlight=False)
         console.print(self.ended, highlight=False)
@@ -128,7 +131,7 @@ def improve(
     Raises:
         TypeError, ValueError: bad input, before any long work.
     """
-    say, keep = progress or (lambda sentence: None), keep or (lambda story: None)
+    say, keep, seed = callback("progress", progress), callback("keep", keep), whole_number("seed", seed, 0)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
@@ -162,6 +165,15 @@ def improve(
             return Story(tuple(steps), _left_out([candidate.name for candidate in nearest], found, last.comparison))
 
 
+def _size(result: FitResult, name: str) -> list[str]:
+    """What was fitted of an effect that was added, and what was chosen for it, in words."""
+    rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
+    told = [f"{n} = {' ± '.join(rounded(value, error))}{'' if u == '1' else f' {u}'}" for n, (value, error, u) in rows]
+    chosen = result.params[name].settings().items()
+    told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
+    return [f"{sentence}." for sentence in told]
+
+
 def _start_of(model: NoiseModel) -> str:
     """A model in words: effects beyond the paper's by their names."""
     beyond = [name for name in model.names if name not in WITH_LIKELIHOOD]
@@ -174,7 +186,7 @@ def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...
         return
     typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
     base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
-    check_fits(base, stack)
+    check_fits(base, stack, "model")
     for effect in not_in(base, candidates):
         check_effects(base.add(effect), stack)
 

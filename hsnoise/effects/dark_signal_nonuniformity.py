@@ -19,7 +19,8 @@ class DarkSignalNonuniformity(AbstractEffect):
     In dark frames: a grain that stays when frames are averaged, equally strong in all exposures.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
+            electrons are then DN over the mean gain of the pixels.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU).
     """

@@ -19,7 +19,8 @@ class FrameOffset(AbstractEffect):
     In dark frames: the mean of frames scatters by more than the noise of their pixels allows, in all colours alike.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
+            electrons are then DN over the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """

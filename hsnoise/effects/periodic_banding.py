@@ -24,7 +24,8 @@ class PeriodicBanding(AbstractEffect):
 
     Attributes:
         axis: "row" for a sinusoid over rows (horizontal bands), "column" for one over columns.
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
+            electrons are then DN over the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (pick-up noise).
     """

@@ -21,7 +21,8 @@ class TapOffsets(AbstractEffect):
 
     Attributes:
         taps: number of outputs, at least 2.
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain.
+        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
+            electrons are then DN over the mean gain of the pixels.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (nonuniformity of columns).
     """

@@ -152,6 +152,9 @@ def test_improve_finds_adds_and_ends(few_candidates):
     assert [step.added for step in story.steps] == [None, "dark_signal_nonuniformity"]
     assert story.errors[0] > 4 and story.errors[1] < 2.5
     assert "dark_signal_nonuniformity" in str(story) and "->" in str(story)
+    value, error, _ = story.fit.table["dark_signal_nonuniformity.sigma"]
+    assert f"dark_signal_nonuniformity.sigma = {value:.2f}"[:-1] in str(story) and error > 0
+    assert "dark_signal_nonuniformity.after_gain: " in str(story)
 
 
 @pytest.mark.parametrize(("sigma_e", "error_e", "there"), [(0.058, 0.036, False), (0.09, 0.02, True)])
@@ -228,6 +231,11 @@ def test_large_captures_are_cut_but_keep_their_rows():
         (lambda s: hsnoise.diagnose(3, s), TypeError, "fit"),
         (lambda s: hsnoise.diagnose(MODEL, s, draws=4), ValueError, "draws"),
         (lambda s: hsnoise.compare(MODEL.remove("adc"), s), ValueError, "adc"),
+        (lambda s: hsnoise.compare(MODEL, s, progress=3), TypeError, "progress: expected a function"),
+        (lambda s: hsnoise.diagnose(MODEL, s, seed=-1), ValueError, "seed: expected at least 0"),
+        (lambda s: hsnoise.diagnose(hsnoise.cameras.canon_5d3(), s), ValueError, "fit: made for"),
+        (lambda s: hsnoise.improve(s, keep=3), TypeError, "keep: expected a function"),
+        (lambda s: hsnoise.improve(s, seed=1.5), TypeError, "seed: expected a whole number"),
         (lambda s: hsnoise.improve(s, candidates=fx.RowNoise(1.0)), TypeError, "candidates"),
         (lambda s: hsnoise.fit(hsnoise.summarise(s), model=MODEL.add(fx.RowNoise(0.1))), ValueError, "frames"),
     ],

@@ -33,7 +33,7 @@ FAULTS = {
     "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
     "nothing": (lambda signal: None, "my_effect: .* returned None, .* is a return missing"),
     "complex": (lambda signal: signal + 1j, "my_effect: .* complex numbers"),
-    "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity for .* of the pixels"),
+    "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity in .* % of the pixels"),
     "infinity": (lambda signal: signal.at[:, 3].divide(0.0), "my_effect: .* NaN or infinity"),
     "unit": (lambda signal: signal + 1e9, r"my_effect: .* signal of 1e\+09 e- .* units that it declares"),
 }
