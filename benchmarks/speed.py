@@ -1,4 +1,5 @@
-"""How fast: sampling and its gradient, histograms, likelihood, fits, diagnosis, beside what users would take instead.
+"""How fast: sampling and its gradient, histograms, likelihood, fits, diagnosis, training, beside what users would
+take instead.
 
     python -m benchmarks.speed
     python -m benchmarks.speed --only sampling,passes --rounds 3
@@ -26,6 +27,8 @@ from rich.console import Console
 from rich.table import Table
 
 import hsnoise
+from benchmarks._noisy import camera_of
+from benchmarks._training import Recipe, Trainer, examples
 from hsnoise.effects import ADC
 from hsnoise.physics import evaluate, physics_of
 from hsnoise.plan import plan_rules
@@ -232,6 +235,29 @@ def diagnose(rounds: int) -> list[Line]:
     return lines
 
 
+def training(rounds: int) -> list[Line]:
+    """A step of the enhancer, 16 maps, 8 frames of 32 pixels, batch 4: noise included, given, and by PyTorch."""
+    camera = camera_of("canon_5d3", None, None)
+    trainer = Trainer(Recipe(maps=16, decay=False), 1, camera, camera.model)
+    state = trainer.start(0)
+    batch = np.random.default_rng(0).integers(0, 256, (4, 8, 32, 32, 3), np.uint8)
+    light, draw = jnp.asarray(camera.white_e, jnp.float32), eqx.filter_jit(examples)
+    clean, noisy = draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light)
+    contestants: dict[str, Callable[[], object]] = {
+        "whole step": lambda: trainer.step(state, batch, 0, 0)[1],
+        "noise alone": lambda: draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light),
+    }
+    try:
+        from benchmarks import _torch_stlstm
+    except ImportError:
+        pass
+    else:
+        frames = (np.asarray(x).swapaxes(0, 1) for x in (noisy, clean))
+        contestants["PyTorch, noise given"] = _torch_stlstm.training_step(state[0], *frames, 1e-3)
+    what = "ST-LSTM, 16 maps, 4 x 8 frames of 32 pixels"
+    return [Line("training", what, who, 1e3 * t, "ms") for who, t in medians(contestants, rounds).items()]
+
+
 PARTS = {
     "sampling": sampling,
     "gradient": gradient,
@@ -240,6 +266,7 @@ PARTS = {
     "fit": fit,
     "growth": growth,
     "diagnose": diagnose,
+    "training": training,
 }
 
 

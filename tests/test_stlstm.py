@@ -144,3 +144,19 @@ def test_state_of_another_size_is_named():
         NET(jnp.zeros((8, 8, 3)), NET.init_state((8, 10)))
     with pytest.raises(ValueError, match="frame 1 has shape"):
         list(enhance(NET, [np.zeros((8, 8, 3)), np.zeros((8, 9, 3))]))
+
+
+def test_training_is_that_of_the_same_network_in_pytorch():
+    """The peer of benchmarks.speed does the same work: losses of three steps of Adam agree."""
+    pytest.importorskip("torch")
+    from benchmarks._torch_stlstm import training_step
+
+    rng = np.random.default_rng(0)
+    noisy, clean = rng.uniform(0, 2, (2, 3, 2, 16, 32, 3)).astype(np.float32)
+    net, optimiser = STLSTM(jax.random.key(0), maps=4), optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2))
+    step, memory = training_step(net, noisy, clean, 1e-2), optimiser.init(eqx.filter(net, eqx.is_array))
+    for _ in range(3):
+        value, slope = eqx.filter_value_and_grad(lambda net: loss(net.video(noisy), clean))(net)
+        assert step() == pytest.approx(float(value), rel=1e-4)
+        change, memory = optimiser.update(slope, memory)
+        net = eqx.apply_updates(net, change)
