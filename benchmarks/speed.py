@@ -236,7 +236,7 @@ def diagnose(rounds: int) -> list[Line]:
 
 
 def training(rounds: int) -> list[Line]:
-    """A step of the enhancer, 16 maps, 8 frames of 32 pixels, batch 4: noise included, given, and by PyTorch."""
+    """A step of the enhancer, 16 maps, 4 x 8 frames of 32 pixels: with its noise, the noise alone, and by PyTorch."""
     camera = camera_of("canon_5d3", None, None)
     trainer = Trainer(Recipe(maps=16, decay=False), 1, camera, camera.model)
     state = trainer.start(0)
@@ -245,7 +245,9 @@ def training(rounds: int) -> list[Line]:
     clean, noisy = draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light)
     contestants: dict[str, Callable[[], object]] = {
         "whole step": lambda: trainer.step(state, batch, 0, 0)[1],
-        "noise alone": lambda: draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light),
+        "light, noise and colours alone": lambda: draw(
+            batch, jax.random.key(0), trainer.camera.model, trainer.noise, light
+        ),
     }
     try:
         from benchmarks import _torch_stlstm

@@ -8,7 +8,6 @@ import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from functools import partial, reduce
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,9 @@ from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
 from hsnoise._poisson import Regime, regime_of
 from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced
-from hsnoise.arrivals import Arrivals, merged
+from hsnoise.arrivals import merged
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
+from hsnoise.signal_chain import apply_by_effect, apply_fenced, apply_in_one, signals
 
 FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 
@@ -236,7 +236,9 @@ def sample(
     """
     light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
     capture = dataclasses.replace(capture, differentiable=differentiable)
-    return _apply_in_one(key, light, shape, effects, capture).reshape(np.shape(clean))
+    inside_another = any(is_traced(leaf) for leaf in jax.tree.leaves((key, light, effects, capture)))
+    apply = apply_fenced if inside_another and not differentiable else apply_in_one
+    return apply(key, light, shape, effects, capture).reshape(np.shape(clean))
 
 
 def sample_dark(
@@ -267,7 +269,7 @@ def sample_by_effect(
     Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
     window: as in FrameStack, where the frames lie on a larger sensor.
     """
-    return _apply(key, *_prepared(key, clean, params, exposure_s, sensor_key, window))
+    return apply_by_effect(key, *_prepared(key, clean, params, exposure_s, sensor_key, window))
 
 
 def dark_signals(
@@ -275,7 +277,7 @@ def dark_signals(
 ) -> Iterator[tuple[AbstractEffect, Array]]:
     """What leaves each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
-    return _signals(key, *_prepared(key, clean, params, exposure_s, None))
+    return signals(key, *_prepared(key, clean, params, exposure_s, None))
 
 
 def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
@@ -316,54 +318,6 @@ def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
         return "any"
     dark = float(rate) * float(exposure_s)
     return regime_of(low + dark, high + dark)
-
-
-def _apply(key, light, shape, effects, capture):
-    return reduce(
-        lambda _, step: step[1], _signals(key, light, shape, effects, capture), jnp.broadcast_to(light, shape)
-    )
-
-
-def _signals(key, light, shape, effects, capture):
-    scales = [_read_noise_scale(key, effect, capture, shape) for effect in effects if _may_scale(effect)]
-    scales = [scale for scale in scales if scale is not None]
-    if scales:
-        capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
-    signal = light
-    for effect in effects:
-        try:
-            drawn = _sample_one(key, signal, shape, effect, capture)
-        except Exception as error:
-            error.add_note(f"in the sample of the effect {effect.name}")
-            raise
-        if drawn is None:
-            raise ValueError(f"{effect.name}: its sample returned None, expected the signal; is a return missing?")
-        if np.shape(drawn) != shape:
-            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
-        if jnp.iscomplexobj(drawn):
-            raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
-        signal = drawn
-        yield effect, signal
-
-
-_apply_in_one = partial(jax.jit, static_argnums=2)(_apply)
-
-
-def _may_scale(effect: AbstractEffect) -> bool:
-    return type(effect).read_noise_scale is not AbstractEffect.read_noise_scale
-
-
-@partial(jax.jit, static_argnums=3)
-def _read_noise_scale(key, effect, capture, shape):
-    return effect.read_noise_scale(capture, shape, key=named_key(key, effect.name))
-
-
-@partial(jax.jit, static_argnums=2)
-def _sample_one(key, signal, shape, effect, capture):
-    own = named_key(key, effect.stream or effect.name)
-    if isinstance(effect, Arrivals):
-        return effect.expose(signal, shape, capture, key=own)
-    return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)
 
 
 def _fit_to_channels(effect: AbstractEffect, channels: tuple[str, ...]) -> AbstractEffect:

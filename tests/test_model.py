@@ -28,6 +28,7 @@ from hsnoise.effects import (
     param,
 )
 from hsnoise.model import NoiseModel, sample, sample_dark
+from hsnoise.mosaic import electrons_of, mosaic
 
 KEY = jax.random.key(19)
 P_VALUE = 1e-5
@@ -366,3 +367,18 @@ def test_what_is_no_random_key_is_named(name, key):
     keys = {"key": jax.random.key(0), "sensor_key": jax.random.key(1), name: key}
     with pytest.raises(TypeError, match=f"^{name}: expected one random key"):
         sample(keys["key"], np.zeros((1, 4, 4)), canon_5d3(), sensor_key=keys["sensor_key"])
+
+
+def test_draws_within_a_larger_program_are_the_same_and_stay_whole():
+    """XLA would compute them anew for each of the colours that are taken from them."""
+    camera, light = canon_5d3(), jnp.linspace(0.0, 30.0, 2 * 16 * 24 * 3).reshape(2, 16, 24, 3)
+
+    def planes(key, light):
+        return electrons_of(sample(key, mosaic(light, camera.cfa), camera), camera)
+
+    compiled = jax.jit(planes).lower(jax.random.key(3), light).compile()
+    assert jax.default_backend() != "cpu" or "conditional" in compiled.as_text()
+    np.testing.assert_allclose(compiled(jax.random.key(3), light), planes(jax.random.key(3), light), rtol=1e-6)
+    keys = jax.random.split(jax.random.key(4), 2)
+    batch = jax.jit(jax.vmap(planes, (0, None)))(keys, light)
+    np.testing.assert_allclose(batch, [planes(key, light) for key in keys], rtol=1e-6)
