@@ -173,9 +173,11 @@ def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
     state, steps, done = _begin(solver, y), 0, False
     while not done and steps < STEPS:
         ahead = vector + whiten @ state.y_eval
-        value, gradient = gradient_at(coordinates, ahead, summary, rules)
-        fair = np.isfinite(value) & (np.abs(ahead - vector) < reach).all()
-        told = (reference - value, -(whiten.T @ gradient)) if fair else (FAR_OFF, jnp.zeros_like(y))
+        told = FAR_OFF, jnp.zeros_like(y)
+        if (np.abs(ahead - vector) < reach).all():  # most steps of a search that comes to this fence lie beyond it
+            value, gradient = gradient_at(coordinates, ahead, summary, rules)
+            if np.isfinite(value):
+                told = reference - value, -(whiten.T @ gradient)
         y, state, done = _step(solver, y, told, state)
         steps += 1
     return vector + whiten @ y, steps
