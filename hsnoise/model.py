@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise._arguments import check_key, checked_exposure, checked_light
+from hsnoise._arguments import check_key, checked_exposure, checked_light, whole_number
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
@@ -250,8 +250,15 @@ def sample_dark(
     exposure_s: float | Scalar | None = None,
     sensor_key: RandomKey | None = None,
 ) -> Array:
-    """Draw dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`."""
-    clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
+    """Draw `n_frames` dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`.
+
+    Raises TypeError, ValueError as `sample`, and for a number of frames or a shape that is none.
+    """
+    n_frames = whole_number("n_frames", n_frames, 1)
+    if not isinstance(shape, tuple | list) or len(shape) != 2:
+        raise ValueError(f"shape: expected (rows, columns), got {shape!r}")
+    rows, columns = (whole_number("shape", size, 1) for size in shape)
+    clean = np.broadcast_to(np.float32(0), (n_frames, rows, columns))
     return sample(key, clean, params, exposure_s=exposure_s, sensor_key=sensor_key)
 
 

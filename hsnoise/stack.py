@@ -339,6 +339,10 @@ def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
     Raises:
         TypeError: keywords beside a `FrameStack`, which holds them already, or that it does not know; or a path.
     """
+    known = [name for name in inspect.signature(FrameStack).parameters if name != "counts"]
+    unknown = [name for name in keywords if name not in known]
+    if unknown:
+        raise TypeError(f"{', '.join(unknown)}: expected keywords among {', '.join(known)}")
     if isinstance(array_or_stack, FrameStack):
         if keywords:
             raise TypeError(
@@ -351,8 +355,4 @@ def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
         )
     if not hasattr(array_or_stack, "__len__") and not hasattr(array_or_stack, "shape"):
         raise TypeError(f"stack: expected a FrameStack or an array of counts, got {type(array_or_stack).__name__}")
-    known = [name for name in inspect.signature(FrameStack).parameters if name != "counts"]
-    unknown = [name for name in keywords if name not in known]
-    if unknown:
-        raise TypeError(f"{', '.join(unknown)}: expected keywords among {', '.join(known)}")
     return FrameStack(array_or_stack, **keywords)

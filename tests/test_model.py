@@ -382,3 +382,18 @@ def test_draws_within_a_larger_program_are_the_same_and_stay_whole():
     keys = jax.random.split(jax.random.key(4), 2)
     batch = jax.jit(jax.vmap(planes, (0, None)))(keys, light)
     np.testing.assert_allclose(batch, [planes(key, light) for key in keys], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "shape", "error", "message"),
+    [
+        ((6, 96, 128), 0.1, TypeError, "n_frames: expected a whole number"),
+        (6, (6, 96, 128), ValueError, r"shape: expected \(rows, columns\)"),
+        (6, 96, ValueError, r"shape: expected \(rows, columns\)"),
+        (0, (4, 4), ValueError, "n_frames: expected at least 1"),
+        (1, (4, -4), ValueError, "shape: expected at least 1"),
+    ],
+)
+def test_sizes_of_dark_frames_are_checked(n_frames, shape, error, message):
+    with pytest.raises(error, match=message):
+        sample_dark(jax.random.key(0), n_frames, shape, canon_5d3())

@@ -13,6 +13,7 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.improve import _is_there
@@ -190,6 +191,18 @@ def test_a_capture_of_one_exposure_is_offered_no_clamp():
         hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0), darks
     )
     assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_gain", [False, True])
+def test_an_offset_is_found_on_its_side_of_the_gain(few_candidates, after_gain, tmp_path):
+    camera = hsnoise.cameras.canon_5d3()
+    like = empty_stack(frames=8, model=camera)
+    behind = draw_capture(31, camera.add(fx.RowNoise(1.5, after_gain=True)), like)
+    stack = behind if after_gain else _simulated(tmp_path)[0]  # the demo's, with longer exposures
+    found = hsnoise.diagnose(hsnoise.fit(stack), stack)
+    assert found.names == ("row_noise",)
+    assert found.best.effect.after_gain is after_gain
 
 
 @pytest.mark.slow
