@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +95,8 @@ def short_loop(monkeypatch):
     def improve(stack, *, keep, **_):
         fit, groups = hsnoise.fit(stack), {"noise": 1.0}
         errors = [Comparison(error, groups, (), (), 0.5, -3.0, ()) for error in (40.0, 1.2)]
-        steps = [Step(fit, e, None, added, -9.0, ()) for e, added in zip(errors, (None, "row_noise"), strict=True)]
+        added = replace(fit, params=fit.params.add(hsnoise.effects.RowNoise(1.0)))
+        steps = [Step(fit, errors[0], None, None, -9.0, ()), Step(added, errors[1], None, "row_noise", -9.0, ())]
         keep(Story((steps[0],), "Not finished."))
         return Story(tuple(steps), "Nothing significant is left.")
 
