@@ -242,20 +242,21 @@ def training(rounds: int) -> list[Line]:
     state = trainer.start(0)
     batch = np.random.default_rng(0).integers(0, 256, (4, 8, 32, 32, 3), np.uint8)
     light, draw = jnp.asarray(camera.white_e, jnp.float32), eqx.filter_jit(examples)
-    clean, noisy = draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light)
+
+    def drawn() -> tuple[jax.Array, jax.Array]:
+        return draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light)
+
     contestants: dict[str, Callable[[], object]] = {
         "whole step": lambda: trainer.step(state, batch, 0, 0)[1],
-        "light, noise and colours alone": lambda: draw(
-            batch, jax.random.key(0), trainer.camera.model, trainer.noise, light
-        ),
+        "light, noise and colours alone": drawn,
     }
     try:
         from benchmarks import _torch_stlstm
     except ImportError:
         pass
     else:
-        frames = (np.asarray(x).swapaxes(0, 1) for x in (noisy, clean))
-        contestants["PyTorch, noise given"] = _torch_stlstm.training_step(state[0], *frames, 1e-3)
+        clean, noisy = (np.asarray(x).swapaxes(0, 1) for x in drawn())
+        contestants["PyTorch, noise given"] = _torch_stlstm.training_step(state[0], noisy, clean, 1e-3)
     what = "ST-LSTM, 16 maps, 4 x 8 frames of 32 pixels"
     return [Line("training", what, who, 1e3 * t, "ms") for who, t in medians(contestants, rounds).items()]
 

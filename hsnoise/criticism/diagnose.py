@@ -232,12 +232,17 @@ def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judg
     leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
     wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
     varied = [judge(of, evidence, np.array(of.amplitudes)) for of in bench.fingerprints(wanted, MANY_DETAILS)]
-    makers = {one.of.name: given(*refined([one.candidate(evidence).effect], bench, evidence)) for one in varied}
-    prints = bench.fingerprints({name: (maker, AROUND) for name, maker in makers.items()}, CLOSE_DETAILS)
-    again = [judge(of, evidence, CLOSE) for of in prints]
+    again = [_drawn_close(one.candidate(evidence).effect, bench, evidence) for one in varied]
     # Not against the leaders as they were: of few draws, rare counts seem to scatter less than they do.
     better = [max(pair, key=lambda one: one.score) for pair in zip(varied, again, strict=True)]
     return _best_first([*better, *judged[len(leaders) :]])
+
+
+def _drawn_close(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> Judged:
+    """An effect with parameters brought closer to the capture, judged by many draws around them."""
+    maker = given(*refined([effect], bench, evidence))
+    (of,) = bench.fingerprints({effect.name: (maker, AROUND)}, CLOSE_DETAILS)
+    return judge(of, evidence, CLOSE)
 
 
 def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
@@ -249,14 +254,10 @@ def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> list
     effect = first.candidate(evidence).effect
     if first.score <= EVIDENCE or not hasattr(effect, "after_gain"):
         return judged
-    sides = []
-    for after_gain in (False, True):
-        (closer,) = refined([replace(effect, **{"after_gain": after_gain})], bench, evidence)
-        (of,) = bench.fingerprints({first.of.name: (given(closer), AROUND)}, CLOSE_DETAILS)
-        sides.append(judge(of, evidence, CLOSE))
-    closer_one = max(sides, key=lambda one: one.score)
+    sides = [_drawn_close(replace(effect, **{"after_gain": side}), bench, evidence) for side in (False, True)]
+    closer = max(sides, key=lambda one: one.score)
     # Scores of many draws are lower: rare counts seem to scatter less in few. Far lower, the search has gone astray.
-    return _best_first([closer_one if closer_one.score > NEAR * first.score else first, *judged[1:]])
+    return _best_first([closer if closer.score > NEAR * first.score else first, *judged[1:]])
 
 
 def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evidence: Evidence) -> Pair | None:
