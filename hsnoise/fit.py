@@ -27,6 +27,7 @@ OUTLIERS_FROM = 1e-4
 SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
+NOT_CONVERGED = "NOT CONVERGED: "
 WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
 
 
@@ -90,9 +91,10 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
             result, converged = _by_likelihood(summary, model, start)
         if converged:
             return result
+        why = result.outcome.removeprefix(NOT_CONVERGED)
         if method == "ml" or with_clamp:
-            raise RuntimeError(f"fit: maximum likelihood did not converge: {result.outcome}")
-        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({result.outcome}); the line fit instead")
+            raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
+        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
 
 
 def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, progress, keywords) -> FitResult:
@@ -163,7 +165,7 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         names=tuple(names[i] for i in kept),
         covariance=covariance[np.ix_(kept, kept)],
         method="ml",
-        outcome=("converged: " if maximum.converged else "NOT CONVERGED: ") + maximum.outcome,
+        outcome=("converged: " if maximum.converged else NOT_CONVERGED) + maximum.outcome,
         iterations=maximum.iterations,
         log_likelihood=maximum.log_likelihood,
         notes=(),

@@ -122,13 +122,17 @@ class NoiseModel(eqx.Module):
 
     def __repr__(self) -> str:
         head = f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
-        try:
-            parameters = self.parameters()
-        except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
-            return head
-        units = {"1": ""}
-        lines = [f"  {p.name} = {p.value:.6g} {units.get(p.spec.unit, p.spec.unit)}".rstrip() for p in parameters]
-        return "\n".join([head, *lines])
+        lines = [head]
+        for effect in self.effects:
+            try:
+                parameters = effect.parameters(self.channels)
+            except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
+                return head
+            units = {"1": ""}
+            lines += [f"  {p.name} = {p.value:.6g} {units.get(p.spec.unit, p.spec.unit)}".rstrip() for p in parameters]
+            chosen = effect.settings().items()
+            lines += [f"  {effect.name}.{field} = {value}" for field, value in chosen if value is not None]
+        return "\n".join(lines)
 
     def parameters(self) -> list[Parameter]:
         """All numbers of the model with name, value, unit, bounds and meaning."""

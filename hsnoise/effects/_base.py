@@ -264,6 +264,10 @@ class AbstractEffect(eqx.Module):
         declared = {field.name: field.metadata.get("parameter") for field in dataclasses.fields(cls)}
         return {name: spec for name, spec in declared.items() if spec is not None}
 
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{field.name}={_shown(getattr(self, field.name))}" for field in dataclasses.fields(self))
+        return f"{type(self).__name__}({shown})"
+
     def settings(self) -> dict[str, Any]:
         """Static fields, which are no physical parameters: field name to value."""
         static = [field.name for field in dataclasses.fields(self) if field.metadata.get("static", False)]
@@ -284,6 +288,13 @@ class AbstractEffect(eqx.Module):
             else:
                 listed.append(Parameter(name, shortest(value.reshape(())), spec))
         return listed
+
+
+def _shown(value: Any) -> str:
+    """A field as Python would write it; numbers that are traced, or shapes alone, as Equinox does."""
+    if not isinstance(value, jax.Array | np.ndarray) or is_traced(value):
+        return eqx.tree_pformat(value)
+    return np.array2string(np.asarray(value), separator=", ", precision=6)
 
 
 def shortest(value: np.ndarray | np.floating) -> float:

@@ -254,3 +254,13 @@ def test_gradients_are_finite(effect):
 
     gradient = jax.grad(smooth, argnums=(0, 1))(model_of(effect), 0.1)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+@each_effect
+def test_it_prints_as_it_is_written(effect):
+    again = eval(repr(effect), dict(vars(hsnoise.effects)))
+    assert again.settings() == effect.settings()
+    for name in effect.specs():
+        np.testing.assert_allclose(getattr(again, name), getattr(effect, name), rtol=1e-5)
+    shown = str(model_of(effect))
+    assert all(f"{effect.name}.{name} = {value}" in shown for name, value in effect.settings().items() if value)
