@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
@@ -15,6 +17,7 @@ from hsnoise._frames import LazyFrames
 from hsnoise._types import Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
+MOSAIC_SIGMA = 6.0
 
 
 def span(name: str, value: Any, size: int) -> slice:
@@ -60,6 +63,33 @@ def callback(name: str, function: Any) -> Callable[..., Any]:
     if function is not None and not callable(function):
         raise TypeError(f"{name}: expected a function or None, got {function!r}")
     return function or (lambda *told: None)
+
+
+def counter(say: Callable[[str], Any], text: str) -> Callable[[], None]:
+    """A function that says `text` and how often it was called: "Drawing: 12"."""
+    numbers = itertools.count(1)
+    return lambda: say(f"{text}: {next(numbers)}")
+
+
+def warn_of_a_mosaic(frame: np.ndarray) -> None:
+    """Warn if a frame [row, column], said to be mono, looks like a colour mosaic.
+
+    What the pixels of 2 x 2 blocks differ by beyond offsets of rows and of columns is 0 on a mono sensor, in the mean
+    and in the noise; gains of three colours leave both.
+    """
+    rows, columns = (size // 2 * 2 for size in frame.shape)
+    pixels = frame[:rows, :columns].astype(float)
+    pixels = pixels.reshape(rows // 2, 2, columns // 2, 2)
+    squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2
+    sign = np.array([[1, -1], [-1, 1]])[None, :, None, :]
+    blocks = [(sign * values).sum((1, 3)).ravel() for values in (pixels, squares)]
+    scores = [abs(one.mean()) / max(one.std() / np.sqrt(one.size), 1e-12) for one in blocks]
+    if max(scores) > MOSAIC_SIGMA:
+        warnings.warn(
+            "cfa: read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it"
+            " is one, give its Bayer order: cfa='RGGB', say",
+            stacklevel=4,
+        )
 
 
 def check_key(name: str, key: Any) -> None:

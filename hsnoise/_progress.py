@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -51,8 +50,3 @@ def busy(text: str) -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(text, total=None)
         yield lambda sentence: progress.update(task, description=sentence)
-
-
-def counter(say: Callable[[str], None], text: str) -> Callable[[], None]:
-    numbers = itertools.count(1)
-    return lambda: say(f"{text}: {next(numbers)}")

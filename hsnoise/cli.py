@@ -7,6 +7,7 @@ import csv
 import io
 import re
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from rich.progress import track
 
 import hsnoise
 from hsnoise import _enhance, _options, cameras, report
+from hsnoise._arguments import counter
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically, write_figure
-from hsnoise._progress import busy, counter, fit_with_progress
+from hsnoise._progress import busy, fit_with_progress
 from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
@@ -60,12 +62,18 @@ def main(argv: list[str] | None = None) -> int:
     if args.command is None:
         parser.print_help()
         return 2
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        RUN[args.command](args)
+        with warnings.catch_warnings():
+            warnings.simplefilter("once")
+            warnings.showwarning = lambda message, *_, **__: console.print(
+                f"Note: {_with_options(str(message))}.", style="yellow", markup=False
+            )
+            RUN[args.command](args)
     except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
         if args.debug:
             raise
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"hsnoise: {_sentence(error)}", markup=False)
+        console.print(f"hsnoise: {_sentence(error)}", markup=False)
         return 2
     except KeyboardInterrupt:
         print("hsnoise: interrupted", file=sys.stderr)
@@ -76,11 +84,15 @@ def main(argv: list[str] | None = None) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    text = " ".join(str(error).split())
-    # Users of the command line know its options, not the arguments of the library.
+    return _with_options(" ".join(str(error).split()))
+
+
+def _with_options(text: str) -> str:
+    """A message of the library for users of the command line, who know its options, not arguments."""
     argument, colon, rest = text.partition(":")
     text = f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
-    return re.sub(r"\b(\w+)=(?=\W|$|['\"\d])", lambda m: f"{OPTIONS[m[1]]} " if m[1] in OPTIONS else m[0], text)
+    with_value = re.compile(r"\b(\w+)=(?=(['\"\d])|\W|$)")
+    return with_value.sub(lambda m: f"{OPTIONS[m[1]]}{' ' if m[2] else ''}" if m[1] in OPTIONS else m[0], text)
 
 
 # Commands

@@ -47,6 +47,11 @@ class Comparison:
     log_likelihood_per_pixel: float
     skipped: tuple[str, ...]
 
+    @property
+    def own_misfit(self) -> float:
+        """The misfit that the worst group takes on the model's own draws, their median: what `error` is measured by."""
+        return max(self.groups.values()) / self.error if self.error > 0 else 1.0
+
     def plot(self):
         """A figure of where the model fails: `hsnoise.plots.comparison`."""
         from hsnoise import plots  # matplotlib is slow to import

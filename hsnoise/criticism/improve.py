@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import callback, whole_number
+from hsnoise._arguments import callback, counter, whole_number
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.gaussian import shrunk
@@ -28,7 +29,7 @@ CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 MOST_STEPS = 6
 MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
-HELD_OUT_DRAWS = 40
+LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 MOVED_SIGMA = 2.0
@@ -61,10 +62,12 @@ class Story:
     Attributes:
         steps: from the first fit to the last that was kept.
         ended: why it ended, in a sentence.
+        split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
     """
 
     steps: tuple[Step, ...]
     ended: str
+    split: str = ""
 
     @property
     def fit(self) -> FitResult:
@@ -74,6 +77,12 @@ class Story:
     @property
     def params(self) -> NoiseModel:
         return self.fit.params
+
+    @property
+    def start(self) -> str:
+        """The first model in words: effects beyond the paper's by their names."""
+        beyond = [name for name in self.steps[0].fit.params.names if name not in WITH_LIKELIHOOD]
+        return " + ".join(["the paper's model", *beyond])
 
     @property
     def errors(self) -> tuple[float, ...]:
@@ -92,7 +101,7 @@ class Story:
         for i, step in enumerate(self.steps):
             worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
             held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
-            name = step.added or _start_of(step.fit.params)
+            name = step.added or self.start
             table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
         console.print(table)
         for i, step in enumerate(self.steps):
@@ -107,7 +116,9 @@ class Story:
                     console.print(f"  {sentence}", highlight=False)
             for sentence in step.moved:
                 console.print(f"  {sentence}", highlight=False)
-        console.print(self.ended, highlight=False)
+        for sentence in (self.ended, self.split):
+            if sentence:
+                console.print(sentence, highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
@@ -135,34 +146,67 @@ def improve(
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
+    work, split = _Work(fitted, held_out, seed, say), _told_of(fitted, held_out)
     say("Fitting the first model")
-    result = fit(fitted, model=model)
-    steps: list[Step] = [_step(result, fitted, held_out, None, None, seed, say)]
+    steps: list[Step] = [work.step(fit(fitted, model=model), None, None)]
     while True:
         if len(steps) > MOST_STEPS:
-            return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.")
+            return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.", split)
         last = steps[-1]
-        keep(Story(tuple(steps), UNFINISHED))
-        say("Looking for what is missing")
+        keep(Story(tuple(steps), UNFINISHED, split))
         own = [c for c in candidates if c.name not in last.fit.params]
-        found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000)
+        tick = counter(say, "Looking for what is missing")
+        found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000, progress=tick)
         steps[-1] = last = replace(last, diagnosis=found)
         nearest = _nearest(found)
         if not nearest:
-            return Story(tuple(steps), _end(found, last.comparison))
+            return Story(tuple(steps), _end(found, last.comparison), split)
         for candidate in nearest:
-            say(f"Adding {candidate.name}")
-            try:
-                result = _with_one_more(steps, candidate.effect, fitted)
-            except (RuntimeError, ValueError) as error:
-                say(f"{candidate.name} cannot be fitted here: {error}")
-                continue
-            step = _step(result, fitted, held_out, candidate.name, last, seed, say)
-            if _is_better(step, last) and _is_there(candidate.effect, result):
+            step = work.with_one_more(steps, candidate)
+            if step is not None and _is_better(step, last) and _is_there(candidate.effect, step.fit):
                 steps.append(step)
                 break
         else:
-            return Story(tuple(steps), _left_out([candidate.name for candidate in nearest], found, last.comparison))
+            ended = _left_out([candidate.name for candidate in nearest], found, last.comparison)
+            return Story(tuple(steps), ended, split)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What every step is made of: frames to fit, frames held out, the seed, and whom to tell."""
+
+    fitted: FrameStack
+    held_out: FrameStack | None
+    seed: int
+    say: Callable[[str], None]
+
+    def step(self, result: FitResult, added: str | None, before: Step | None) -> Step:
+        self.say("Comparing with the model's own samples")
+        comparison = compare(result.params, self.fitted, seed=self.seed)
+        unseen = float("nan") if self.held_out is None else _log_likelihood(result.params, self.held_out, self.seed)
+        return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
+
+    def with_one_more(self, steps: list[Step], candidate: Candidate) -> Step | None:
+        """The model with the candidate, on the side of the gain where it fits better; None if it cannot be fitted.
+
+        `diagnose` judges the side from a base fit that the effect has bent.
+        """
+        fits: list[FitResult] = []
+        for effect in _sides(candidate.effect):
+            text = f"Adding {effect.name}" if effect is candidate.effect else "The same on the other side of the gain"
+            self.say(text)
+            try:
+                fits.append(_fit_with(effect, steps, self.fitted, counter(self.say, text)))
+            except (RuntimeError, ValueError) as error:
+                self.say(f"{effect.name} cannot be fitted here: {error}")
+        if not fits:
+            return None
+        best = (
+            fits[0]
+            if len(fits) == 1
+            else max(fits, key=lambda one: _log_likelihood(one.params, self.fitted, self.seed))
+        )
+        return self.step(best, candidate.name, steps[-1])
 
 
 def _size(result: FitResult, name: str) -> list[str]:
@@ -172,12 +216,6 @@ def _size(result: FitResult, name: str) -> list[str]:
     chosen = result.params[name].settings().items()
     told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
     return [f"{sentence}." for sentence in told]
-
-
-def _start_of(model: NoiseModel) -> str:
-    """A model in words: effects beyond the paper's by their names."""
-    beyond = [name for name in model.names if name not in WITH_LIKELIHOOD]
-    return " + ".join(["the paper's model", *beyond])
 
 
 def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
@@ -236,12 +274,31 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
     return tuple(one for one in found.ranking[:MOST_TRIED] if one.score > EVIDENCE)
 
 
-def _with_one_more(steps: list[Step], effect: AbstractEffect, fitted: FrameStack) -> FitResult:
+def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
+    """The effect, and if it may arise before or behind the gain, the same on the other side."""
+    if not hasattr(effect, "after_gain"):
+        return (effect,)
+    return effect, replace(effect, **{"after_gain": not effect.after_gain})
+
+
+def _fit_with(effect: AbstractEffect, steps: list[Step], fitted: FrameStack, tick: Callable[[], None]) -> FitResult:
+    """A fit of the last model and one effect more; it goes on from the last fit by likelihood if that holds."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != "synthetic"), None)
     if base is None or any(name in WITH_LIKELIHOOD and name not in base.params for name in model.names):
         return fit(fitted, model=model)
-    return fit_synthetic(base, fitted, model)
+    return fit_synthetic(base, fitted, model, progress=tick)
+
+
+def _told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
+    """Which frames were fitted and which held out, in words."""
+    if held_out is None:
+        return ""
+    first, last = min(fitted.n_frames), min(held_out.n_frames)
+    return (
+        f"Fitted and compared were the first {first} dark frames of each exposure; held-out: the log-likelihood of the"
+        f" statistics of the other {last}, in nats (one more: 2.7 times as probable)."
+    )
 
 
 def _split(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
@@ -253,16 +310,9 @@ def _split(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack
     return stack.select(frames=slice(0, fewest - spared)), darks.select(frames=slice(fewest - spared, fewest))
 
 
-def _step(result, fitted, held_out, added, before: Step | None, seed: int, say) -> Step:
-    say("Comparing with the model's own samples")
-    comparison = compare(result.params, fitted, seed=seed)
-    likelihood = float("nan") if held_out is None else _held_out(result.params, held_out, seed)
-    return Step(result, comparison, None, added, likelihood, () if before is None else _moved(before.fit, result))
-
-
-def _held_out(model: NoiseModel, frames: FrameStack, seed: int) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of frames that no fit has seen."""
-    own = reference(model, frames, HELD_OUT_DRAWS, seed + 5000)
+def _log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
+    own = reference(model, frames, LIKELIHOOD_DRAWS, seed + 5000)
     values = measure(frames, model).values
     law = shrunk(own.own_z(), np.zeros((1, len(values))))
     return float(law.log_density(own.z(values)) - np.log(own.deviation).sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -16,7 +17,13 @@ from rich.progress import track
 
 from hsnoise._arguments import KINDS, numbers, one_of, span
 from hsnoise._frames import crop, in_order, shift_cfa
-from hsnoise.io._grouping import group_by_exposure, group_counts, group_exposure_s, group_temperature_c
+from hsnoise.io._grouping import (
+    RELATIVE_TOLERANCE,
+    group_by_exposure,
+    group_counts,
+    group_exposure_s,
+    group_temperature_c,
+)
 from hsnoise.io._recording import UNKNOWN_ORDER, Recording
 from hsnoise.stack import FrameStack
 
@@ -48,7 +55,7 @@ def load(
 
     Only headers are read now; frames are read one at a time when the stack is iterated (.npz files are loaded
     whole). Frames of one kind whose exposures agree to 1e-3 form a group; darks first, short before long.
-    What is given here overrides what the files say.
+    What is given here overrides what the files say; a warning tells of exposures that differ.
 
     Args:
         path: a folder, a glob pattern, one file, or a list of files; all of one format. A folder's files are
@@ -152,6 +159,7 @@ def _with_exposures(read: list[Recording], exposure_s: Any, source: str) -> list
     if exposure_s is not None:
         given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
         values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
+        _warn_of_other_exposures(read, values)
     else:
         values = [recording.exposure_s for recording in read]
     for recording, value in zip(read, values, strict=True):
@@ -160,6 +168,16 @@ def _with_exposures(read: list[Recording], exposure_s: Any, source: str) -> list
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{recording.path}: expected an exposure_s >= 0, got {value} s")
     return [replace(recording, exposure_s=value) for recording, value in zip(read, values, strict=True)]
+
+
+def _warn_of_other_exposures(read: list[Recording], given: list[float]) -> None:
+    for recording, value in zip(read, given, strict=True):
+        own = recording.exposure_s
+        if own is not None and abs(value - own) > RELATIVE_TOLERANCE * own:
+            warnings.warn(
+                f"exposure_s: {recording.path} says {own:g} s; the given {value:g} s are taken instead", stacklevel=4
+            )
+            return
 
 
 def _check_sizes(read: list[Recording]) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
 
 MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]
-NOTABLE = 3.0
+ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
+MOST_TICKS = 3  # to either side of 0
+LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
 def comparison(found) -> Figure:
@@ -20,18 +22,37 @@ def comparison(found) -> Figure:
     Args:
         found: result of `hsnoise.compare`.
     """
-    rows = sorted(found.table, key=lambda row: -abs(row[4]))[:MOST_BARS]
-    height = 0.32 * max(len(found.groups), len(rows)) + 1.6
-    figure = new_figure(11.0, height, f"Model against measurement: error {found.error:.2f}")
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.3])
+    rows = sorted(found.table, key=lambda row: -abs(row[4]))[:MOST_BARS][::-1]
+    height = 0.32 * max(len(found.groups), len(rows)) + 2.0
+    figure = new_figure(11.0, height, f"Model against measurement: error {_number(found.error)}")
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.1])
     groups = sorted(found.groups.items(), key=lambda item: item[1])
-    _bars(left, [name for name, _ in groups], np.sqrt([misfit for _, misfit in groups]))
-    left.set_xlabel("rms deviation / σ of the model's own draws")
+    misfits, own = np.array([misfit for _, misfit in groups]), found.own_misfit
+    left.barh([name for name, _ in groups], np.maximum(misfits, LEAST_MISFIT), color=_colours(misfits > ALARM_AT * own))
+    left.set_xscale("log")
+    left.set_xlim(LEAST_MISFIT, 2 * max(misfits.max(), 10.0))
+    left.axvline(1.0, color=FIT, linewidth=0.8)
+    left.axvline(own, color=FIT, linewidth=0.8, linestyle="--")
+    left.set_xlabel(f"misfit (line: 1, expected; dashed: its own samples,\n{own:.2g}; orange: more than twice that)")
     left.set_title("groups of statistics", fontsize=10)
-    _bars(right, [row[0] for row in rows][::-1], np.array([row[4] for row in rows][::-1]))
-    right.set_xlabel("(measured - model) / σ")
+    left.xaxis.set_major_locator(LogLocator(numticks=5))
+    left.xaxis.set_major_formatter(_plain)
+    tidy(left)
+    z = np.array([row[4] for row in rows])
+    right.barh([row[0] for row in rows], z, color=_colours(np.abs(z) > NOTABLE_Z))
+    _wide_scale(right)
+    right.set_xlabel("(measured - model) / σ of its own samples\n(orange: beyond 4)")
     right.set_title("statistics that are furthest off", fontsize=10)
+    tidy(right)
     return figure
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _colours(alarming: np.ndarray) -> list[str]:
+    return [ALARM if one else BAR for one in alarming]
 
 
 def ranking(found) -> Figure:
@@ -59,7 +80,7 @@ def story(found) -> Figure:
     """
     figure = new_figure(max(5.0, 1.8 * len(found.steps) + 2.5), 4.2, "Error of the model, step by step")
     axes = figure.subplots()
-    names = ["the paper's model", *(f"+ {step.added}" for step in found.steps[1:])]
+    names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
     x = np.arange(len(names))
     axes.plot(x, found.errors, "o-", color=BAR, markersize=8)
     for at, error in zip(x, found.errors, strict=True):
@@ -74,22 +95,20 @@ def story(found) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, names: list[str], values: np.ndarray) -> None:
-    axes.barh(names, values, color=[ALARM if abs(v) > NOTABLE else BAR for v in values])
-    _wide_scale(axes)
-    tidy(axes)
-
-
 def _wide_scale(axes: Axes) -> None:
     """Linear up to 5, logarithmic beyond, either sign, with plain numbers and not too many of them."""
-    low, high = axes.dataLim.x0, axes.dataLim.x1
-    axes.set_xscale("symlog", linthresh=5)
-    axes.set_xlim(min(1.4 * low, 0), max(1.4 * high, 0))
+    low, high = 1.4 * min(axes.dataLim.x0, 0), 1.4 * max(axes.dataLim.x1, 0)
     far = max(high, -low)
-    ticks = [5, 10, 20, 50, 100, 200] if far < 300 else [5.0 * 10**k for k in range(0, 9, 1 if far < 1e4 else 2)]
-    axes.set_xticks(
-        [x for x in [*(-t for t in ticks[::-1]), 0, *ticks] if 1.4 * min(low, 0) <= x <= 1.4 * max(high, 0)]
-    )
-    axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}")
-    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlim(low, high)
+    if far > 10:
+        axes.set_xscale("symlog", linthresh=5)
+        decades = 10.0 ** np.arange(1, np.floor(np.log10(far)) + 1)
+        ticks = [5, 20, 50] if far < 100 else decades[:: int(np.ceil(len(decades) / MOST_TICKS))]
+        axes.set_xticks([x for x in [*(-t for t in ticks[::-1]), 0, *ticks] if low <= x <= high])
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(_plain)
     axes.axvline(0, color=FIT, linewidth=0.8)
+
+
+def _plain(x: float, _=None) -> str:
+    return f"{x:.0e}".replace("e+0", "e") if abs(x) >= 1e6 else f"{x:,g}"

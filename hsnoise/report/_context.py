@@ -50,6 +50,7 @@ def context(
         "ranking": [] if diagnosis is None else ranking(diagnosis),
         "story": None if story is None else steps(story),
         "ended": "" if story is None else story.ended,
+        "split": "" if story is None else story.split,
     }
 
 
@@ -126,7 +127,7 @@ def bars(comparison: Comparison) -> dict[str, Any]:
     `own`: misfit that the worst group takes on the model's own samples.
     """
     groups = sorted(comparison.groups.items(), key=lambda item: -item[1])
-    own = groups[0][1] / comparison.error if comparison.error > 0 else 1.0
+    own = comparison.own_misfit
     span = np.log(1.1 * max(groups[0][1], own, 10.0) / LEAST_SHOWN)
 
     def at(misfit: float) -> str:

@@ -46,6 +46,8 @@ def render(
     at = _measured.shown(stack, fit.params if isinstance(fit, FitResult) else fit, seed, shortest=shortest)
     figures = {f"{NAMES[c]}, counts": histogram(at, c) for c in at.channels}
     figures |= {f"{NAMES[c]}, {LINES[axis]} spectrum": spectrum(at, c, axis) for axis in (0, 1) for c in at.channels}
+    if len(at.measured) > 1:
+        figures |= {f"{NAMES[c]}, frame means": frame_means(at, c) for c in at.channels}
     environment = Environment(
         loader=PackageLoader("hsnoise.report"),
         autoescape=True,
@@ -69,8 +71,10 @@ def frames(at: Shown) -> dict[str, Any]:
     pair = [_measured.crop(one[0]) for one in (at.measured, at.drawn[0])]
     low, high = np.percentile(pair[0], STRETCH)
     high = max(high, low + 1)
+    rows, columns = pair[0].shape
+    part = f"{'All' if pair[0].shape == at.measured.shape[1:] else 'The middle'} {rows} x {columns} pixels"
     measured, drawn = (_png(np.clip((one - low) / (high - low), 0, 1)) for one in pair)
-    return {"measured": measured, "drawn": drawn, "low": f"{low:g}", "high": f"{high:g}", "size": pair[0].shape}
+    return {"measured": measured, "drawn": drawn, "low": f"{low:g}", "high": f"{high:g}", "part": part}
 
 
 def _png(grey: np.ndarray) -> str:
@@ -109,6 +113,19 @@ def spectrum(at: Shown, channel: str, axis: int) -> Figure:
     axes.loglog(k, power, "o", color=COLOURS[channel], markersize=4.5, label="measured")
     for along, values in ((axes.xaxis, k), (axes.yaxis, [*power, *drawn.ravel()])):
         _few_decades(along, min(values), max(values))
+    return _legend(figure, axes)
+
+
+def frame_means(at: Shown, channel: str) -> Figure:
+    """Mean of each frame of a colour over the mean of all: measured (points), and of all draws (lines)."""
+    means = [_measured.frame_means(one, at.cfa, channel) for one in (at.measured, *at.drawn)]
+    figure, axes = _panel(f"{NAMES[channel]}, frames", "frame number", "frame mean - mean of all / DN")
+    number = np.arange(len(means[0]))
+    for drawn in means[1:]:
+        axes.plot(number, drawn, color=FIT, linewidth=0.9, alpha=0.6)
+    axes.plot([], [], color=FIT, linewidth=0.9, label="model")
+    axes.plot(number, means[0], "o", color=COLOURS[channel], markersize=4.5, label="measured")
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     return _legend(figure, axes)
 
 

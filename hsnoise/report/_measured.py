@@ -96,6 +96,12 @@ def histogram_edges(at: Shown, channel: str) -> np.ndarray:
     return np.arange(first - 0.5, last + step, step)
 
 
+def frame_means(frames: np.ndarray, cfa: str, channel: str) -> np.ndarray:
+    """Mean of each frame of a colour less the mean of all, DN [frame]."""
+    means = np.array([channel_pixels(frame, cfa, channel).mean() for frame in frames])
+    return means - means.mean()
+
+
 def share(frames: np.ndarray, cfa: str, channel: str, edges: np.ndarray) -> np.ndarray:
     """Share of the pixels of a colour per DN in each bin."""
     pixels = np.clip(_pixels(frames, cfa, channel), edges[0] + 0.25, edges[-1] - 0.25)

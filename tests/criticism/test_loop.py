@@ -16,7 +16,7 @@ from hsnoise import effects as fx
 from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.improve import _is_there
+from hsnoise.criticism.improve import Step, _is_there, _Work
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -203,6 +203,17 @@ def test_an_offset_is_found_on_its_side_of_the_gain(few_candidates, after_gain, 
     found = hsnoise.diagnose(hsnoise.fit(stack), stack)
     assert found.names == ("row_noise",)
     assert found.best.effect.after_gain is after_gain
+
+
+@pytest.mark.slow
+def test_improve_decides_the_side_of_the_gain_by_refits(tmp_path):
+    """Whatever side `diagnose` took."""
+    stack, told = _simulated(tmp_path)[0], []
+    steps = [Step(hsnoise.fit(stack), SimpleNamespace(), None, None, float("nan"), ())]
+    wrong = SimpleNamespace(name="row_noise", effect=fx.RowNoise(1.4, after_gain=True))
+    step = _Work(stack, None, 0, told.append).with_one_more(steps, wrong)
+    assert step.fit.params["row_noise"].after_gain is False and step.comparison.error < 2
+    assert "Adding row_noise" in told and any("other side of the gain: " in sentence for sentence in told)
 
 
 @pytest.mark.slow

@@ -1,0 +1,55 @@
+"""What is no error but worth telling before long work: a mosaic read as mono, exposures that files contradict."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise._arguments import warn_of_a_mosaic
+from hsnoise.cli import main
+
+
+def darks(exposure_s=0.2):
+    model = hsnoise.cameras.canon_5d3()
+    return np.asarray(hsnoise.sample_dark(jax.random.key(0), 2, (160, 240), model, exposure_s=exposure_s))
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, 0.2])
+def test_a_mosaic_read_as_mono_is_told(exposure_s):
+    with pytest.warns(UserWarning, match="cfa: read as mono"):
+        warn_of_a_mosaic(darks(exposure_s)[0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rows_columns_and_hot_pixels_make_no_mosaic(seed):
+    """Warnings are errors in the tests."""
+    rng = np.random.default_rng(seed)
+    frame = rng.poisson(5, (101, 150)) + rng.normal(0, 3, (101, 1)) + rng.normal(0, 3, (1, 150))
+    frame += 2.0 * (np.arange(150) % 2)  # odd-even pattern
+    frame[rng.integers(0, 101, 20), rng.integers(0, 150, 20)] += 1e4
+    warn_of_a_mosaic(np.rint(frame))
+
+
+def test_check_of_a_stack_tells_once_and_not_of_a_colour_sensor():
+    stack = hsnoise.FrameStack([darks()], [0.2], cfa="RGGB")
+    stack.check()
+    with pytest.warns(UserWarning, match="cfa: read as mono"):
+        hsnoise.FrameStack([darks()], [0.2]).check()
+
+
+def test_exposures_that_files_contradict_are_told(tmp_path):
+    np.savez(tmp_path / "darks.npz", counts=darks()[None], exposure_s=[0.2], cfa="RGGB")
+    with pytest.warns(UserWarning, match=r"exposure_s: .*darks.npz says 0.2 s; the given 3 s are taken"):
+        stack = hsnoise.load(tmp_path / "darks.npz", exposure_s=3)
+    assert stack.exposure_s.tolist() == [3]
+    assert hsnoise.load(tmp_path / "darks.npz", exposure_s=0.2).exposure_s.tolist() == [0.2]
+
+
+def test_the_command_line_tells_of_its_own_options(tmp_path, capsys):
+    np.savez(tmp_path / "darks.npz", counts=darks()[None], exposure_s=[0.2])
+    assert main(["compare", str(tmp_path / "darks.npz"), "--model", "canon_5d3", "--exposure", "3"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Note: --exposure: " in said
+    assert "give it --cfa and --shutter)" in said
