@@ -17,7 +17,7 @@ from hsnoise._frames import LazyFrames
 from hsnoise._types import Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
-MOSAIC_SIGMA = 6.0
+MOSAIC_SIGMA, LEAST_PIXELS = 6.0, 1024
 
 
 def span(name: str, value: Any, size: int) -> slice:
@@ -78,6 +78,8 @@ def warn_of_a_mosaic(frame: np.ndarray) -> None:
     and in the noise; gains of three colours leave both.
     """
     rows, columns = (size // 2 * 2 for size in frame.shape)
+    if rows * columns < LEAST_PIXELS:
+        return
     pixels = frame[:rows, :columns].astype(float)
     pixels = pixels.reshape(rows // 2, 2, columns // 2, 2)
     squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2

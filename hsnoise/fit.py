@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._arguments import check_no_copies
+from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
 from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
@@ -119,6 +119,8 @@ def _summary_of(stack, progress) -> Summary:
         raise ValueError(
             f"counts: a fit needs frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}"
         )
+    if stack.cfa == "mono":
+        warn_of_a_mosaic(stack.frame(int(np.argmax(stack.exposure_s)), 0))
     summary = summarise(stack, progress)
     _check_copies(summary)
     return summary

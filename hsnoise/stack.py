@@ -21,7 +21,6 @@ from hsnoise._arguments import (
     positive,
     span,
     temperatures,
-    warn_of_a_mosaic,
     window_of,
 )
 from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
@@ -203,15 +202,11 @@ class FrameStack:
     def check(self) -> None:
         """Read the first frame of each exposure, check its values and the black level; call before long work.
 
-        Warns if frames said to be mono look like a colour mosaic.
-
         Raises:
             ValueError: see `check_frame`; also a black level above the data.
         """
         first = [self.frame(i, 0) for i in range(self.n_exposures)]
         check_black_level(first, self.black_level, self.cfa)
-        if self.cfa == "mono":
-            warn_of_a_mosaic(first[int(np.argmax(self.exposure_s))])
 
     def select(
         self,

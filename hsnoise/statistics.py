@@ -14,9 +14,9 @@ import equinox as eqx
 import numpy as np
 
 from hsnoise._arguments import callback
+from hsnoise._counting import Bins, count_rows
 from hsnoise._frames import channel_planes
-from hsnoise._threads import in_threads
-from hsnoise._types import channels_of
+from hsnoise._types import cfa_tile, channels_of
 from hsnoise.stack import FrameStack
 
 BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
@@ -24,9 +24,7 @@ RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
 FLICKER = 0.5  # of the mean: more is another light
 OUTLIER_SCALE = 2.0
-SAMPLE_PIXELS = 200_000
-BLOCK_PIXELS = 32_768  # of a Bayer plane that a thread counts at a time: copies of them stay in its cache
-MOST_TABLE = 65_535  # codes up to this find their bin in a table
+SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise
 
 
 class RowHistograms(eqx.Module):
@@ -220,22 +218,28 @@ def _reduced(
     frame: np.ndarray, cfa: str, coding: dict[str, tuple[int, int, int]], bins: int, white_level: float | None
 ):
     """Of each channel of a frame: histograms [row, bin], and sums of counts and of their squares [2, row]."""
-    highest, pixels = int(frame.max()), row_pixels(frame.shape, cfa)
-    bin_of = {c: _bin_of(low, width, bins, white_level, highest) for c, (low, width, _) in coding.items()}
-    rows = {c: len(frame) // row_stride(cfa, c) for c in coding}
-    out = {c: (np.empty((n, bins), _count_type(pixels)), np.empty((2, n))) for c, n in rows.items()}
-
-    def reduce(start: int) -> None:
-        for c, (counts, sums) in out.items():
-            codes = channel_rows(frame[start : start + step], cfa, c).astype(np.intp)
-            at = slice(start // row_stride(cfa, c), start // row_stride(cfa, c) + len(codes))
-            as_floats = codes.astype(np.float64)
-            counts[at] = _count_rows(bin_of[c](codes), bins)
-            sums[:, at] = codes.sum(1), np.vecdot(as_floats, as_floats)
-
-    step = 2 * max(1, BLOCK_PIXELS // pixels)
-    in_threads(reduce, range(0, len(frame), step))
+    counts, sums = count_rows(frame, _bins(coding, cfa, bins, white_level), bins)
+    dtype, out = _count_type(row_pixels(frame.shape, cfa)), {}
+    for c in coding:
+        if cfa == "mono":
+            out[c] = counts[:, 0].astype(dtype), sums[..., 0]
+            continue
+        planes, stride = channel_planes(cfa, c), row_stride(cfa, c)
+        rows = len(frame) // stride
+        out[c] = np.empty((rows, bins), dtype), np.empty((2, rows))
+        for row, column in planes:
+            at = slice(row if stride == 1 else 0, None, len(planes))
+            out[c][0][at], out[c][1][:, at] = counts[row::2, column], sums[:, row::2, column]
     return out
+
+
+def _bins(coding: dict[str, tuple[int, int, int]], cfa: str, number: int, white_level: float | None) -> Bins:
+    """The bins of each place in the colour pattern. Codes at the white level are clipped: all are in the last bin."""
+    tile = cfa_tile(cfa)
+    low, width, _ = np.array([coding[c] for c in channels_of(cfa)]).T
+    end = low + width * (number - 2)
+    end = end if white_level is None else np.minimum(end, int(np.ceil(white_level)))
+    return Bins(low[tile], width[tile], end[tile])
 
 
 def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
@@ -259,15 +263,15 @@ def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
 def _codings(stack: FrameStack, group: int) -> dict[str, tuple[int, int, int]]:
     """`_coding` of each channel of an exposure, from its first and last frame."""
     numbers = sorted({0, stack.n_frames[group] - 1})
-    samples = [_samples(stack.frame(group, n), stack.cfa, stack.channels, len(numbers)) for n in numbers]
-    codings = in_threads(lambda of: _coding(np.stack(of), stack.white_level), zip(*samples, strict=True))
-    return dict(zip(stack.channels, codings, strict=True))
+    thin = [_some_rows(stack.frame(group, n), len(cfa_tile(stack.cfa)), len(numbers)) for n in numbers]
+    samples = (np.stack([channel_rows(rows, stack.cfa, c) for rows in thin]) for c in stack.channels)
+    return {c: _coding(sample, stack.white_level) for c, sample in zip(stack.channels, samples, strict=True)}
 
 
-def _samples(frame: np.ndarray, cfa: str, channels: tuple[str, ...], frames: int) -> list[np.ndarray]:
-    """Every n-th row of each channel, about SAMPLE_PIXELS in `frames` frames; copies, so that the frame may go."""
-    rows = (channel_rows(frame, cfa, c) for c in channels)
-    return [y[:: max(1, frames * y.size // SAMPLE_PIXELS)].copy() for y in rows]
+def _some_rows(frame: np.ndarray, step: int, frames: int) -> np.ndarray:
+    """Every n-th row (or pair of rows) of a frame, about SAMPLE_PIXELS of each place in the pattern in `frames`."""
+    cells = frame.reshape(-1, step * frame.shape[1])
+    return cells[:: max(1, frames * frame.size // (step**2 * SAMPLE_PIXELS))].reshape(-1, frame.shape[1])
 
 
 def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, int]:
@@ -300,31 +304,6 @@ def _edges(low: int, width: int, bins: int, white_level: float | None) -> np.nda
     edges = low - 0.5 + width * np.arange(bins - 1, dtype=np.float64)
     # Counts at the white level are clipped: they may hold everything above, so no edge lies beyond.
     return edges if white_level is None else np.minimum(edges, white_level - 0.5)
-
-
-def _bin_of(low: int, width: int, bins: int, white_level: float | None, highest: int):
-    """The function from codes up to `highest` to their bins of `_edges`."""
-
-    def compute(codes: np.ndarray) -> np.ndarray:
-        at = codes - low
-        if width > 1:
-            at //= width
-        at += 1
-        np.clip(at, 0, bins - 1, out=at)
-        if white_level is not None:
-            at[codes >= white_level] = bins - 1
-        return at
-
-    if highest > MOST_TABLE:
-        return compute
-    table = compute(np.arange(highest + 1))
-    return lambda codes: table.take(codes, mode="clip")  # no code is out of range: clipping saves a check
-
-
-def _count_rows(at: np.ndarray, bins: int) -> np.ndarray:
-    """Histogram of each row of bins `at`, which it changes."""
-    at += (bins * np.arange(len(at)))[:, None]
-    return np.bincount(at.ravel(), minlength=bins * len(at)).reshape(len(at), bins)
 
 
 def _flat_moments(stack: FrameStack, groups: list[int], tick) -> FlatMoments:

@@ -32,11 +32,14 @@ def test_rows_columns_and_hot_pixels_make_no_mosaic(seed):
     warn_of_a_mosaic(np.rint(frame))
 
 
-def test_check_of_a_stack_tells_once_and_not_of_a_colour_sensor():
-    stack = hsnoise.FrameStack([darks()], [0.2], cfa="RGGB")
-    stack.check()
-    with pytest.warns(UserWarning, match="cfa: read as mono"):
-        hsnoise.FrameStack([darks()], [0.2]).check()
+def test_a_fit_tells_before_the_work_and_not_of_a_colour_sensor():
+    def stop():
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        hsnoise.fit(hsnoise.FrameStack([darks()], [0.2], cfa="RGGB"), progress=stop)
+    with pytest.warns(UserWarning, match="cfa: read as mono"), pytest.raises(InterruptedError):
+        hsnoise.fit(hsnoise.FrameStack([darks()], [0.2]), progress=stop)
 
 
 def test_exposures_that_files_contradict_are_told(tmp_path):
