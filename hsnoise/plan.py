@@ -16,10 +16,10 @@ from hsnoise.physics import Block, Physics, RowRule, Rules, binning, dark_laws, 
 from hsnoise.statistics import RowHistograms, Summary, round_up, without_counts
 
 SCAN_NODES = 256
-KEEP_NATS = 40.0  # a node where every row of a group is this far below its best is left out
+KEEP_NATS = 25.0  # a node where every row of a group is this far below its best is left out
 MARGIN = 1.35  # in beta on either side, so that the parameters may move during a fit
 EXTREME_ROWS = 6
-NODES_PER_SIGMA = 1.0  # of the sharpest row; the trapezoid's error is exp(-2 pi^2) (Poisson summation)
+NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
 GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
 

@@ -18,8 +18,7 @@ from jax.scipy.special import log_ndtr, logsumexp
 
 ITERATIONS = 80
 WHOLE_STEPS = 20  # later ones are shortened, against going round in circles
-TOLERANCE_FLOAT32 = 1e-4
-TOLERANCE = 1e-5  # the evidence is stationary at the fixed point: its error is the square of this, a row
+TOLERANCE = 1e-4  # the evidence is stationary at the fixed point: its error is the square of this, a row
 FAILED = 0.5  # a frame that still changes by more, in deviations of a row, has no evidence: NaN
 FARTHEST, FARTHEST_SIGMA = 0.1, 2.0  # that a row's gain moves in one step: so far and so many of its own deviations
 PRIOR_REACH = 7.5  # standard deviations of the row gain that the nodes cover
@@ -204,18 +203,22 @@ def _consistent(rows: Curves, spectrum):
     ones = jnp.ones(rows.layout.place.shape, spectrum.dtype)
     start = (ones, ones[:, 0]), (ones, jnp.broadcast_to(spectrum.mean(), ones[:, 0].shape))
 
-    def iterate(rows: Curves, start, tolerance: float):
+    def iterate(rows: Curves, start, change):
         def step(state):
             count, _, _, (mean, variance) = state
             return count + 1, *_step(rows, spectrum, mean, variance, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
 
-        state = (0, jnp.full_like(start[0][1], jnp.inf), *start)
-        return jax.lax.while_loop(lambda s: (s[0] < ITERATIONS) & (s[1].max() > tolerance), step, state)[1:]
+        def going(state):
+            return (state[0] < ITERATIONS) & (state[1].max() > TOLERANCE)
 
-    # Most of the way in float32, several times as fast; where that fails, float64 goes all of it.
-    _, *near = iterate(rows.in_float32(), start, TOLERANCE_FLOAT32)
+        return jax.lax.while_loop(going, step, (0, change, *start))[1:]
+
+    # In float32, several times as fast; where that fails, float64 goes all of the way.
+    far = jnp.full_like(start[0][1], jnp.inf)
+    near = iterate(rows.in_float32(), start, far)
     sound = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(near)]).all()
-    return iterate(rows, jax.tree.map(partial(jnp.where, sound), tuple(near), start), TOLERANCE)
+    change, *state = jax.tree.map(partial(jnp.where, sound), near, (far, *start))
+    return iterate(rows, tuple(state), change)
 
 
 def _step(rows: Curves, spectrum, mean, variance, most):
