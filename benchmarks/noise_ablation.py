@@ -34,6 +34,7 @@ from benchmarks._training import Recipe, Trainer, batch_rng, digest_of
 from benchmarks._validation import psnr_db
 from hsnoise import NoiseModel
 from hsnoise._output import write_atomically
+from hsnoise._progress import busy
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import GREY, display_from_linear, light_of_frames
 from hsnoise.weights import load_network, save_network
@@ -119,7 +120,8 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
         params.save(paths["paper"])  # the last: it says that all three are there
     if not paths["improved"].exists():
         print(f"{sensor.name}: improving")
-        story = hsnoise.improve(sensor.fitted, progress=lambda text: print(f"  {text} ...", flush=True))
+        with busy("Fitting the first model") as say:
+            story = hsnoise.improve(sensor.fitted, progress=say)
         write_atomically(out / f"{sensor.name}-story.txt", f"{story}\n".encode())
         at_exposure(story.fit.params, sensor.exposure_s).save(paths["improved"])
     return {name: NoiseModel.load(path) for name, path in paths.items()}

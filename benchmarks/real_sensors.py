@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import hsnoise
+from hsnoise._progress import busy
 
 ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 have in common
 REPORTED_GAIN, REPORTED_READ_NOISE_E = 0.422149, 1.98
@@ -118,8 +119,8 @@ def stl1001(folder: Path) -> None:
         print(result)
 
 
-def improved(folder: Path) -> None:
-    """The story of `hsnoise.improve` on the darks of each sensor."""
+def improved(folder: Path, only: list[str]) -> None:
+    """The story of `hsnoise.improve` on the darks of each sensor, or of `only` these."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
     names = [name for name in data.files if name.startswith("dark")]
@@ -129,9 +130,13 @@ def improved(folder: Path) -> None:
     names = ["bias_m05C", "dark_m05C_060s"]
     stacks["STL-1001"] = [data[n] for n in names], [about[n]["exposure_s"] for n in names], 65535
     for sensor, (counts, exposure_s, white_level) in stacks.items():
+        if only and sensor not in only:
+            continue
         print(f"\n{sensor}")
         stack = hsnoise.FrameStack(counts, exposure_s, white_level=white_level, shutter="global")
-        print(hsnoise.improve(stack, progress=lambda sentence: print(f"  {sentence} ...", flush=True)))
+        with busy("Fitting the first model") as say:
+            story = hsnoise.improve(stack, progress=say)
+        print(story)
 
 
 def a7s2(folder: Path, path: Path) -> None:
@@ -159,6 +164,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figure", type=Path, default=Path("docs/figures/imx541_gain.png"))
     parser.add_argument("--improve", action="store_true", help="what the paper's model lacks in each sensor")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="SENSOR", help="with --improve: IMX541, TC-237, STL-1001"
+    )
     arguments = parser.parse_args()
     beside = Path(__file__).resolve().parents[1].parent / "shared"
     folder = Path(os.environ.get("HSNOISE_SHARED", beside)) / "data"
@@ -166,7 +174,7 @@ def main() -> None:
         raise SystemExit(f"no captures in {folder}: set HSNOISE_SHARED to the folder that holds data/")
     if arguments.improve:
         a7s2(folder, arguments.figure.with_name("a7s2_dark_means.png"))
-        improved(folder)
+        improved(folder, arguments.only)
         return
     imx541(folder, arguments.figure)
     tc237(folder)
