@@ -121,8 +121,15 @@ def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple
     light = without_counts(replace(summary, flats=None))
     parts = (some_frames(summary, start, start + frames) for start in range(0, max(summary.n_frames), frames))
     rules = [[plan_rules(physics, part, PIECE_MARGIN, channel=c) for c in channels] for part in parts]
-    most = [reduce(lambda one, other: replan(other, one), [of[c] for of in rules]) for c in channels]
-    darks = [(light, replan(most[c], of[c])) for of in rules for c in channels]
+    # Channels of one stride share a program, too.
+    strides = [h.row_stride for h in summary.histograms]
+    most = {
+        stride: reduce(
+            lambda one, other: replan(other, one), [of[c] for of in rules for c in channels if strides[c] == stride]
+        )
+        for stride in set(strides)
+    }
+    darks = [(light, replan(most[strides[c]], of[c])) for of in rules for c in channels]
     return darks, [] if summary.flats is None else [(replace(summary, histograms=()), ())]
 
 
@@ -131,12 +138,10 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
     values, gradients = [], []
     for point in jnp.asarray(points):
         value, gradient = (np.asarray(x) for x in _prior_at(coordinates, point))
-        prior, slope = value, gradient
         for light, rules in pieces:
             weight = 1.0 if light.histograms else flats_weight
-            of_piece, gradient_of_piece = gradient_at(coordinates, point, light, rules)
-            value = value + weight * (np.asarray(of_piece) - prior)  # each piece has the prior in it
-            gradient = gradient + weight * (np.asarray(gradient_of_piece) - slope)
+            of_piece, slope = likelihood_at(coordinates, point, light, rules)
+            value, gradient = value + weight * np.asarray(of_piece), gradient + weight * np.asarray(slope)
         values.append(value)
         gradients.append(gradient)
     return np.asarray(values), np.asarray(gradients)
@@ -201,12 +206,22 @@ def _step(solver, y, told, state):
     return y, state, done
 
 
-@eqx.filter_jit
 def gradient_at(coordinates, vector, summary, rules):
-    """Log-likelihood plus prior, and its gradient."""
-    return jax.value_and_grad(lambda at: evaluate(coordinates.physics(at), summary, rules) + coordinates.log_prior(at))(
-        vector
-    )
+    """Log-likelihood plus prior, and its gradient.
+
+    Each rule has a program of its own: compiling one for all takes 200 MiB more.
+    """
+    dark = replace(summary, flats=None)
+    parts = [_prior_at(coordinates, vector), *(likelihood_at(coordinates, vector, dark, (rule,)) for rule in rules)]
+    if summary.flats is not None:
+        parts.append(likelihood_at(coordinates, vector, replace(summary, histograms=()), ()))
+    return tuple(map(sum, zip(*parts, strict=True)))
+
+
+@eqx.filter_jit
+def likelihood_at(coordinates, vector, summary, rules):
+    """Log-likelihood and its gradient."""
+    return jax.value_and_grad(lambda at: evaluate(coordinates.physics(at), summary, rules))(vector)
 
 
 def _gradients(coordinates, summary, rules, points):
