@@ -45,8 +45,9 @@ def count_rows(frame: np.ndarray, bins: Bins, number: int) -> tuple[np.ndarray, 
 @partial(jax.jit, static_argnames=("number", "wide"))
 def _count(frame: jax.Array, bins: Bins, number: int, wide: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
     (rows, columns), step = frame.shape, bins.low.shape[1]
-    low, width, end = (jnp.tile(x, (rows // step, 1))[:, None, :].astype(jnp.int32) for x in bins)
-    codes = frame.astype(jnp.int32).reshape(rows, columns // step, step)
+    whole = jnp.int32 if frame.dtype == np.uint16 else jnp.int64
+    low, width, end = (jnp.tile(x, (rows // step, 1))[:, None, :].astype(whole) for x in bins)
+    codes = frame.astype(whole).reshape(rows, columns // step, step)
     above = jnp.clip(codes, low - 1, end) - low
     share = 1 / width.astype(jnp.float64 if wide else jnp.float32)
     at = (

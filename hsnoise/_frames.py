@@ -15,8 +15,12 @@ from hsnoise._types import channels_of
 
 
 def in_order(path: Path) -> list[Any]:
-    """What frames are sorted by: their names, numbers in them by their size."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
+    """What frames are sorted by: their names, numbers in them by their size.
+
+    dark2 comes before dark10, and dark_0.05s before dark_0.1s; of several points (1.2.10) each separates two numbers.
+    """
+    parts = re.split(r"((?<![\d.])\d+\.\d+(?![\d.])|\d+)", path.stem)
+    return [*(float(part) if i % 2 else part.lower() for i, part in enumerate(parts)), path.suffix.lower()]
 
 
 class LazyFrames:

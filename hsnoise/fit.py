@@ -20,7 +20,7 @@ from hsnoise.physics import Physics, physics_of
 from hsnoise.profile import profile_errors
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
-from hsnoise.statistics import Summary, summarise
+from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
 
 OUTLIERS_FROM = 1e-4
@@ -81,20 +81,26 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
         if method == "line":
             return _by_line(summary, model, "the paper's line fit, as asked")
-        result, converged = _by_likelihood(summary, model, start)
-        outside = outlier_fraction(result)
-        if (outside > OUTLIERS_FROM).any():
-            # Again, with a component for the pixels that follow no law of this model.
-            start = eqx.tree_at(
-                lambda p: p.outliers, start, np.clip(outside, OUTLIERS_FROM, 0.2), is_leaf=lambda x: x is None
-            )
-            result, converged = _by_likelihood(summary, model, start)
+        # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
+        outside = far_outliers(summary)
+        result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
+        if (outside <= OUTLIERS_FROM).all():
+            outside = outlier_fraction(result)
+            if (outside > OUTLIERS_FROM).any():
+                result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
         if converged:
             return result
         why = result.outcome.removeprefix(NOT_CONVERGED)
         if method == "ml" or with_clamp:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+
+
+def _with_outliers(start: Physics, share: np.ndarray) -> Physics:
+    """The start with a component for outliers [exposure], if they are more than few."""
+    if (share <= OUTLIERS_FROM).all():
+        return start
+    return eqx.tree_at(lambda p: p.outliers, start, np.clip(share, OUTLIERS_FROM, 0.2), is_leaf=lambda x: x is None)
 
 
 def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, progress, keywords) -> FitResult:

@@ -158,7 +158,7 @@ class NoiseModel(eqx.Module):
             "cfa": self.cfa,
             "shutter": self.shutter,
             "exposure_s": self.exposure_s,
-            "precision": str(jnp.result_type(*leaves)) if leaves else "float32",
+            "precision": str(np.result_type(*(leaf.dtype for leaf in leaves))) if leaves else "float32",
             "effects": [effect_to_json(effect, self.channels) for effect in self.effects],
         }
         write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())

@@ -23,7 +23,7 @@ BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
 RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
 FLICKER = 0.5  # of the mean: more is another light
-OUTLIER_SCALE = 2.0
+OUTLIER_SCALE, NEAR_WIDTHS = 2.0, 6.0
 SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise
 
 
@@ -246,18 +246,33 @@ def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
     """Law of pixels with extra charge: above the median, half exponential near the others, half anywhere.
 
     Thermal generation in silicon leaves an exponential tail of warm pixels; its scale here is OUTLIER_SCALE times the
-    half width of the counts below their median, which outliers do not reach.
+    half width of the counts below their median, which outliers do not reach. Outliers beyond all bins, of which the
+    last one tells how many, have their own share, so that they do not stand for others nearby.
     """
     laws = []
     for pooled, edges in zip(counts.sum((1, 2), dtype=np.float64), edges_dn, strict=True):
         cumulative = np.cumsum(pooled)[:-1] / pooled.sum()
         median, low = (edges[min(np.searchsorted(cumulative, q), len(edges) - 1)] for q in (0.5, 0.1587))
-        scale = OUTLIER_SCALE * max(median - low, 1.0)
-        survival = np.exp(-np.maximum(edges - median, 0.0) / scale)
+        half_width = max(median - low, 1.0)
+        survival = np.exp(-np.maximum(edges - median, 0.0) / (OUTLIER_SCALE * half_width))
         tail = -np.diff(np.concatenate([[1.0], survival, [0.0]]))
         anywhere = np.concatenate([[False], edges >= median]).astype(np.float64)
-        laws.append(0.5 * tail + 0.5 * anywhere / anywhere.sum())
+        near = pooled[:-1][edges > median + NEAR_WIDTHS * half_width].sum()
+        far = pooled[-1] / max(pooled[-1] + near, 1.0) if pooled[-1] > near else 0.0
+        laws.append((1 - far) * 0.5 * (tail + anywhere / anywhere.sum()))
+        laws[-1][-1] += far
     return np.stack(laws)
+
+
+def far_outliers(summary: Summary) -> np.ndarray:
+    """Share of the pixels of each dark exposure in the last, open bin, where the bins before it are emptier."""
+    far, total = np.zeros(len(summary.exposure_s)), np.zeros(len(summary.exposure_s))
+    for h in summary.histograms:
+        pooled = h.counts.sum((1, 2), dtype=np.float64)
+        before = pooled[:, 3 * pooled.shape[1] // 4 : -1].sum(1)
+        far += np.where(pooled[:, -1] > before, pooled[:, -1], 0.0)
+        total += pooled.sum(1)
+    return far / np.maximum(total, 1.0)
 
 
 def _codings(stack: FrameStack, group: int) -> dict[str, tuple[int, int, int]]:
@@ -280,8 +295,10 @@ def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, in
     The range is robust (quantiles), so that hot pixels do not stretch it: what lies outside is one open bin.
     """
     q05, q50, q95 = _quantiles(sample, np.array([0.05, 0.5, 0.95]))
-    sigma = max(float(np.sqrt(np.median(sample.var(-1)))), 0.5)
     reach = RANGE_SIGMAS / 1.645
+    # A row may hold outliers, too.
+    core = np.clip(sample, q50 - reach * max(q50 - q05, 1.0), q50 + reach * max(q95 - q50, 1.0))
+    sigma = max(float(np.sqrt(np.median(core.var(-1)))), 0.5)
     low = int(max(q50 - reach * max(q50 - q05, sigma), 1))  # code 0 is always in the first, open bin
     high = int(q50 + reach * max(q95 - q50, sigma)) + 2
     if white_level is not None:
@@ -303,7 +320,7 @@ def _quantiles(sample: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _edges(low: int, width: int, bins: int, white_level: float | None) -> np.ndarray:
     edges = low - 0.5 + width * np.arange(bins - 1, dtype=np.float64)
     # Counts at the white level are clipped: they may hold everything above, so no edge lies beyond.
-    return edges if white_level is None else np.minimum(edges, white_level - 0.5)
+    return edges if white_level is None else np.minimum(edges, np.ceil(white_level) - 0.5)
 
 
 def _flat_moments(stack: FrameStack, groups: list[int], tick) -> FlatMoments:

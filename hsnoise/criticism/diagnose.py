@@ -51,6 +51,7 @@ LEGEND = (
     " out)"
 )
 NEXT = "next: hsnoise improve, or in Python hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
+SIDES = "whether {} arises before or behind the gain is a first guess: improve fits both and keeps the likelier"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
 LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
@@ -114,7 +115,9 @@ class Diagnosis:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
         console.print(table)
-        for sentence in (LEGEND, *map(_described, self.named), self.advice, NEXT if self.best is not None else ""):
+        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
+        after = [self.advice, *sides, NEXT if self.best is not None else ""]
+        for sentence in (LEGEND, *map(_described, self.named), *after):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()

@@ -297,7 +297,8 @@ def _told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
     first, last = min(fitted.n_frames), min(held_out.n_frames)
     return (
         f"Fitted and compared were the first {first} dark frames of each exposure; held-out: the log-likelihood of the"
-        f" statistics of the other {last}, in nats (one more: 2.7 times as probable)."
+        f" statistics of the other {last}, in nats (one more: 2.7 times as probable). To fit all of them:"
+        " hsnoise.fit(stack, model=story.params)."
     )
 
 

@@ -28,7 +28,9 @@ def comparison(found) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.1])
     groups = sorted(found.groups.items(), key=lambda item: item[1])
     misfits, own = np.array([misfit for _, misfit in groups]), found.own_misfit
-    left.barh([name for name, _ in groups], np.maximum(misfits, LEAST_MISFIT), color=_colours(misfits > ALARM_AT * own))
+    left.barh(
+        [name for name, _ in groups], np.maximum(misfits, 1.1 * LEAST_MISFIT), color=_colours(misfits > ALARM_AT * own)
+    )
     left.set_xscale("log")
     left.set_xlim(LEAST_MISFIT, 2 * max(misfits.max(), 10.0))
     left.axvline(1.0, color=FIT, linewidth=0.8)

@@ -110,11 +110,16 @@ def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
 
 
 def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
-    """Rows of the parameter table; "error" only for a FitResult."""
+    """Rows of the parameter table, with what was chosen for effects; "error" only for a FitResult."""
+    model = fit if isinstance(fit, NoiseModel) else fit.params
+    settings = [(e.name, n, v) for e in model.effects for n, v in e.settings().items() if v is not None]
+    chosen = [{"name": f"{name}.{field}", "value": f"{value}", "unit": ""} for name, field, value in settings]
     if isinstance(fit, NoiseModel):
-        return [{"name": name, "value": f"{v:.5g}", "unit": _unit(unit)} for name, (v, unit) in fit.table().items()]
-    rows = [(name, *rounded(value, error), _unit(unit)) for name, (value, error, unit) in fit.table.items()]
-    return [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in rows]
+        rows = [{"name": name, "value": f"{v:.5g}", "unit": _unit(unit)} for name, (v, unit) in fit.table().items()]
+        return [*rows, *chosen]
+    cells = [(name, *rounded(value, error), _unit(unit)) for name, (value, error, unit) in fit.table.items()]
+    rows = [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in cells]
+    return [*rows, *({**row, "error": "chosen"} for row in chosen)]
 
 
 def _unit(unit: str) -> str:
