@@ -18,6 +18,7 @@ from hsnoise._types import Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
 MOSAIC_SIGMA, LEAST_PIXELS = 6.0, 1024
+MOST_SEED = 2**31  # those of single draws are counted from it
 
 
 def span(name: str, value: Any, size: int) -> slice:
@@ -26,25 +27,42 @@ def span(name: str, value: Any, size: int) -> slice:
     Raises:
         ValueError: it is empty, reaches outside, or has a step.
     """
-    if value is not None and not isinstance(value, slice):
-        value = slice(*value)
-    start, stop, step = (0, size, 1) if value is None else (value.start or 0, value.stop, value.step)
-    stop = size if stop is None else stop
-    if step not in (None, 1) or not 0 <= start < stop <= size:
-        raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
-    return slice(int(start), int(stop))
+    ends = (None, None) if value is None else value
+    if isinstance(ends, slice):
+        ends = (ends.start, ends.stop) if ends.step in (None, 1) else ()
+    ends = listed(name, ends, "(start, stop)")
+    if len(ends) == 2:
+        start, stop = (
+            whole_number(name, default if end is None else end) for end, default in zip(ends, (0, size), strict=True)
+        )
+        if 0 <= start < stop <= size:
+            return slice(start, stop)
+    raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
 
 
-def check_no_copies(prints: Iterable[bytes], exposure_s: float) -> None:
-    """Raise ValueError if two frames of an exposure are the same, told by what stands for each in `prints`."""
-    seen: dict[bytes, int] = {}
-    for number, one in enumerate(prints):
-        first = seen.setdefault(one, number)
-        if first != number:
-            raise ValueError(
-                f"counts: frames {first} and {number} of the {exposure_s:g} s exposure are identical; a copy tells"
-                " nothing of the noise, so give each frame once"
-            )
+def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[float]) -> None:
+    """Raise ValueError if two frames are the same, told by what stands for each, `prints` [exposure, frame]."""
+    seen: dict[bytes, tuple[int, float]] = {}
+    for of_exposure, seconds in zip(prints, exposure_s, strict=True):
+        for number, one in enumerate(of_exposure):
+            first, earlier = seen.setdefault(one, (number, seconds))
+            if (first, earlier) != (number, seconds):
+                which = (
+                    f"frames {first} and {number} of the {seconds:g} s exposure"
+                    if earlier == seconds
+                    else f"frame {first} of the {earlier:g} s exposure and frame {number} of the {seconds:g} s exposure"
+                )
+                raise ValueError(
+                    f"counts: {which} are identical; a copy tells nothing of the noise, so give each frame once"
+                )
+
+
+def seed_of(name: str, value: Any) -> int:
+    """A seed of random draws. Raises TypeError for what is no whole number, ValueError outside 0 to MOST_SEED."""
+    seed = whole_number(name, value, 0)
+    if seed > MOST_SEED:
+        raise ValueError(f"{name}: expected at most {MOST_SEED}, got {value}")
+    return seed
 
 
 def whole_number(name: str, value: Any, least: int | None = None) -> int:
@@ -56,6 +74,13 @@ def whole_number(name: str, value: Any, least: int | None = None) -> int:
     if least is not None and number < least:
         raise ValueError(f"{name}: expected at least {least}, got {value}")
     return number
+
+
+def listed(name: str, value: Any, expected: str) -> tuple[Any, ...]:
+    """`value` as a tuple. Raises TypeError for what is no list."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise TypeError(f"{name}: expected {expected}, got {value!r}")
+    return tuple(value)
 
 
 def callback(name: str, function: Any) -> Callable[..., Any]:
@@ -107,7 +132,7 @@ def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
     """Four numbers that say where frames of `shape` lie on a sensor. Raises ValueError if they lie outside."""
     if window is None:
         return None
-    numbers = tuple(int(n) for n in window)
+    numbers = tuple(whole_number("window", n) for n in listed("window", window, "four whole numbers"))
     if len(numbers) != 4 or min(numbers) < 0 or any(numbers[i] + shape[i] > numbers[i + 2] for i in (0, 1)):
         raise ValueError(
             f"window: expected (first row, first column, rows, columns) of a sensor that holds {shape[0]} x {shape[1]}"
@@ -118,6 +143,10 @@ def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
 
 def exposure_groups(counts: Any) -> tuple[Any, ...]:
     """Counts as one array-like `[frame, row, column]` an exposure, sizes not yet compared."""
+    if isinstance(counts, np.ma.MaskedArray) or (
+        isinstance(counts, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in counts)
+    ):
+        raise TypeError("counts: expected arrays of whole frames, got a masked array; its mask would be ignored")
     if isinstance(counts, list | tuple):
         groups = tuple(_as_array(group) for group in counts)
     else:
@@ -224,7 +253,7 @@ def exposures(exposure_s: Any, n: int) -> np.ndarray:
 
 def kinds(kind: str | Sequence[str], n: int) -> tuple[str, ...]:
     """Kind of each exposure."""
-    given = (kind,) * n if isinstance(kind, str) else tuple(kind)
+    given = (kind,) * n if isinstance(kind, str) else listed("kind", kind, "'dark', 'flat' or a list of them")
     if len(given) != n:
         raise ValueError(f"kind: expected one, or {n} (one an exposure), got {len(given)}: {given}")
     for one in given:

@@ -48,8 +48,7 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     end = min(first + kept, columns)
     part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
     counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
-    for frames_of, exposure_s in zip(counts, part.exposure_s, strict=True):
-        check_no_copies((hashlib.blake2b(frame).digest() for frame in frames_of), exposure_s)
+    check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
     # What depends on the place stays where it is on the sensor.
     window = part.window or ((0, first, rows, columns) if end - first < columns else None)
     return part.with_counts(counts, window)
@@ -76,7 +75,8 @@ def check_effects(model: NoiseModel, like: FrameStack) -> None:
     longest = int(np.argmax(like.exposure_s))
     frames, exposure_s = like.n_frames[longest], float(like.exposure_s[longest])
     gain = float(np.mean(np.asarray(model["gain"].value))) if "gain" in model else 1.0
-    white_dn = 2.0**16 if like.white_level is None else float(like.white_level)
+    largest_dn = max(float(frame.max()) for frame in like.frames(longest))
+    white_dn = max(2.0**16, largest_dn) if like.white_level is None else float(like.white_level)
     for effect, signal in dark_signals(jax.random.key(0), frames, like.shape, model, exposure_s=exposure_s):
         values = np.asarray(signal, float)
         unit, largest = ("e-", white_dn / gain) if effect.acts_at < Stage.GAIN else ("DN", white_dn)

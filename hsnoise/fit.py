@@ -133,10 +133,11 @@ def _summary_of(stack, progress) -> Summary:
 
 
 def _check_copies(summary: Summary) -> None:
-    for e, n in enumerate(summary.n_frames):
+    def prints(e: int, n: int):
         sums = [(h.row_sum[e, :n], h.row_sum_of_squares[e, :n]) for h in summary.histograms]
-        frames = np.concatenate([x for pair in sums for x in pair], axis=1)
-        check_no_copies((frame.tobytes() for frame in frames), summary.exposure_s[e])
+        return (frame.tobytes() for frame in np.concatenate([x for pair in sums for x in pair], axis=1))
+
+    check_no_copies((prints(e, n) for e, n in enumerate(summary.n_frames)), summary.exposure_s)
 
 
 def _check_model(model: NoiseModel) -> bool:

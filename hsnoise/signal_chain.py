@@ -41,6 +41,8 @@ def signals(key, light, shape, effects, capture):
             raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
         if jnp.iscomplexobj(drawn):
             raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
+        if jnp.issubdtype(drawn.dtype, jnp.integer) and effect is not effects[-1]:
+            drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; those after it expect floats
         signal = drawn
         yield effect, signal
 

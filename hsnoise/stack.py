@@ -16,11 +16,13 @@ from hsnoise._arguments import (
     exposures,
     kinds,
     levels,
+    listed,
     one_of,
     photons,
     positive,
     span,
     temperatures,
+    whole_number,
     window_of,
 )
 from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
@@ -228,7 +230,7 @@ class FrameStack:
             ValueError: an empty or outside region, or one with an odd side on a Bayer sensor.
         """
         rows, columns = span("rows", rows, self.shape[0]), span("columns", columns, self.shape[1])
-        groups = np.arange(self.n_exposures)[slice(None) if exposures is None else list(exposures)]
+        groups = np.arange(self.n_exposures) if exposures is None else self._groups(exposures)
         region = (columns, rows) if self.row_axis == 1 else (rows, columns)
         cfa = shift_cfa(self.cfa, rows.start, columns.start)
         changes: dict[str, Any] = {
@@ -243,6 +245,14 @@ class FrameStack:
             row, column, *sensor = self.window
             changes["window"] = (row + rows.start, column + columns.start, *sensor)
         return FrameStack(**{**self._arguments(), **changes})
+
+    def _groups(self, exposures: Any) -> np.ndarray:
+        """Indices of exposure groups. Raises TypeError for what is no list, ValueError for those that there are not."""
+        given = listed("exposures", exposures, "a list of indices of exposures")
+        groups = np.array([whole_number("exposures", i) for i in given], int)
+        if not groups.size or groups.min() < -self.n_exposures or groups.max() >= self.n_exposures:
+            raise ValueError(f"exposures: expected indices from 0 to {self.n_exposures - 1}, got {exposures}")
+        return groups
 
     @staticmethod
     def join(*stacks: FrameStack) -> FrameStack:

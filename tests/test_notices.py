@@ -56,3 +56,9 @@ def test_the_command_line_tells_of_its_own_options(tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "Note: --exposure: " in said
     assert "give it --cfa and --shutter)" in said
+
+
+def test_copies_are_told_across_exposures_too():
+    frames = darks()
+    with pytest.raises(ValueError, match=r"frame 0 of the 0.1 s exposure and frame 0 of the 0.2 s exposure are ident"):
+        hsnoise.fit(hsnoise.FrameStack([frames, frames], [0.1, 0.2], cfa="RGGB"))

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import callback, whole_number
+from hsnoise._arguments import callback, seed_of, whole_number
 from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
@@ -88,7 +88,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     Raises:
         TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
     """
-    draws, seed = whole_number("draws", draws, 8), whole_number("seed", seed, 0)
+    draws, seed = whole_number("draws", draws, 8), seed_of("seed", seed)
     tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import callback, whole_number
+from hsnoise._arguments import callback, listed, seed_of, whole_number
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
@@ -154,7 +154,7 @@ def diagnose(
             returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
     tick = callback("progress", progress)
-    draws, seed = whole_number("draws", draws, MANY_DETAILS), whole_number("seed", seed, 0)
+    draws, seed = whole_number("draws", draws, MANY_DETAILS), seed_of("seed", seed)
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
@@ -281,7 +281,7 @@ def check_candidates(candidates: Any) -> tuple[AbstractEffect, ...]:
     """The candidates of a user. Raises TypeError unless they are effects, ValueError for two of one name."""
     if isinstance(candidates, AbstractEffect):
         raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
-    candidates = tuple(candidates)
+    candidates = listed("candidates", candidates, "a list of effects")
     for effect in candidates:
         if not isinstance(effect, AbstractEffect):
             raise TypeError(f"candidates: expected effects (instances of AbstractEffect), got {effect!r}")

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise._arguments import callback, counter, whole_number
+from hsnoise._arguments import callback, counter, seed_of
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.gaussian import shrunk
@@ -142,7 +142,7 @@ def improve(
     Raises:
         TypeError, ValueError: bad input, before any long work.
     """
-    say, keep, seed = callback("progress", progress), callback("keep", keep), whole_number("seed", seed, 0)
+    say, keep, seed = callback("progress", progress), callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = _split(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
