@@ -39,7 +39,7 @@ MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which the
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
 OFF_BOUNDS = 0.02  # share of the range between two bounds
 SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
-SHRINKAGE = 0.1
+SHRINKAGE, DRAWS_OF_ALL = 0.1, 10.0  # what all numbers say of the scatter of one counts as so many draws
 MARGIN = 1.15
 UNKNOWN = 1e3  # deviation of what the base fit does not know, in sizes
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
@@ -202,6 +202,10 @@ class Problem:
             model = knob.put(model, x)
         return model
 
+    def in_float64(self, y: np.ndarray) -> NoiseModel:
+        with jax.enable_x64(True):
+            return self.at(y)
+
     def statistics(self, part: FrameStack) -> tuple[np.ndarray, np.ndarray]:
         """Score in whitened units and structure, one after the other, and a rough error of each."""
         found = structure(part, black_level_of(self.base.params))
@@ -221,11 +225,6 @@ class Problem:
 
     def draw(self, y: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics(draw_capture(self.seed + number, self.at(y), self.part))
-
-
-def _in_float64(problem: Problem, y: np.ndarray) -> NoiseModel:
-    with jax.enable_x64(True):
-        return problem.at(y)
 
 
 def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed: int = 0, progress=None) -> FitResult:
@@ -256,7 +255,7 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     Gauss-Newton, with Levenberg's damping where a step leads away.
     """
     measured, _ = problem.statistics(problem.part)
-    scale, weight = _weights(problem, problem.start, tick)
+    scale, weight, scattered = _weights(problem, problem.start, tick)
     prior = problem.prior
 
     def point(y: np.ndarray) -> _Point:
@@ -290,7 +289,8 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    covariance = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
+    scattered = [(drawn - drawn.mean(0)) / scale for drawn in (here.drawn, scattered)]
+    covariance = _as_scattered(covariance, gain, scattered)
     return here.y, covariance, length, iterations
 
 
@@ -309,7 +309,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     met = "simulated statistics met" if last_step < LONG_STEP else "NOT CONVERGED: simulated statistics not met"
     return replace(
         base,
-        params=_in_float64(problem, y),
+        params=problem.in_float64(y),
         physics=problem.physics(y),
         names=(*base.names, *(knob.label for knob in problem.knobs)),
         covariance=_not_surer_than(base.covariance, turn @ covariance @ turn.T),
@@ -321,16 +321,17 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     )
 
 
-def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """`covariance` [number, number], widened if estimates from draws that the weights have not seen scatter more.
+def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: list[np.ndarray]) -> np.ndarray:
+    """`covariance` [number, number], widened if estimates from draws scatter more than weights without correlation say.
 
-    gain [number, statistic] leads from statistics to the score; z [draw, statistic] are draws about their mean.
+    gain [number, statistic] leads from statistics to the score; z are sets of draws about their mean [draw, statistic].
     """
-    estimates = z @ (covariance @ gain).T
-    scatter = (estimates**2).sum(0) / (len(z) - 1)
+    estimates = np.concatenate(z) @ (covariance @ gain).T
+    known = len(estimates) - len(z)
+    ratio = (estimates**2).sum(0) / known / np.diagonal(covariance)
     # Few draws: what they say of one number is averaged with what they say of all.
-    ratio = scatter / np.diagonal(covariance)
-    factor = np.sqrt(np.maximum(0.5 * (ratio + ratio.mean()), 1.0))
+    of_all = DRAWS_OF_ALL / (known + DRAWS_OF_ALL)
+    factor = np.sqrt(np.maximum((1 - of_all) * ratio + of_all * ratio.mean(), 1.0))
     return covariance * factor[:, None] * factor[None, :]
 
 
@@ -363,19 +364,19 @@ def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
-    """Deviation [statistic] and inverse correlation of the statistics, the noise of simulated means included."""
+def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Deviation [statistic] and inverse correlation of statistics, noise of simulated means included; their draws."""
     # Of other seeds than the means, which tell how far estimates scatter.
     drawn = in_threads(lambda i: problem.draw(y, MEAN_DRAWS + i), range(COVARIANCE_DRAWS), tick)
-    values, floor = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0)
-    n = len(values)
+    values, floor, n = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0), len(drawn)
     variance = floored_variance(values.var(0, ddof=1), n - 1, floor**2)
     scale = np.sqrt(variance * (1 + 1 / MEAN_DRAWS))
     z = (values - values.mean(0)) / np.sqrt(variance)
     correlation = z.T @ z / (n - 1)
     # Shrunk to its diagonal: fewer draws than statistics.
     share = max(SHRINKAGE, min(1.0, len(scale) / (n * 4)))
-    return scale, np.linalg.inv((1 - share) * correlation + share * np.eye(len(scale)) + 0.02 * np.eye(len(scale)))
+    whole = (1 - share) * correlation + (share + 0.02) * np.eye(len(scale))
+    return scale, np.linalg.inv(whole), values
 
 
 def _draws(problem: Problem, y: np.ndarray, tick) -> np.ndarray:
