@@ -289,8 +289,8 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    scattered = [(drawn - drawn.mean(0)) / scale for drawn in (here.drawn, scattered)]
-    covariance = _as_scattered(covariance, gain, scattered)
+    sets = [(drawn - drawn.mean(0)) / scale for drawn in (here.drawn, scattered)]
+    covariance = _as_scattered(covariance, gain, sets)
     return here.y, covariance, length, iterations
 
 
