@@ -19,6 +19,7 @@ from rich.progress import track
 import hsnoise
 from hsnoise import _enhance, _options, cameras, report
 from hsnoise._arguments import counter
+from hsnoise._frames import LazyFrames
 from hsnoise._options import CAMERAS
 from hsnoise._output import FRAME_FORMATS, frames_file, read_image, write_atomically, write_figure
 from hsnoise._progress import busy, fit_with_progress
@@ -240,9 +241,21 @@ def _load(paths: list[str], args: argparse.Namespace) -> FrameStack:
         "roi": args.roi,
     }
     groups = _captures(paths, exposure_s=_one_or_list(args.exposure), kind=args.kind, **options)
+    if args.exposure is not None and len(args.exposure) > 1:
+        for group in groups:
+            _tell_exposures(group)
     if args.flats:
         groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
     return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
+
+
+def _tell_exposures(stack: FrameStack) -> None:
+    """Which files the exposures of the command line were given to, with the mean of the first frame of each."""
+    for i, (counts, exposure_s) in enumerate(zip(stack.counts, stack.exposure_s, strict=True)):
+        if isinstance(counts, LazyFrames):
+            more = f" and {len(counts.names) - 1} more" if len(counts.names) > 1 else ""
+            mean_dn = stack.frame(i, 0).mean()
+            print(f"{exposure_s:g} s: {counts.names[0]}{more}, mean {mean_dn:.1f} DN", file=sys.stderr)
 
 
 def _captures(paths: list[str], **options: Any) -> list[FrameStack]:

@@ -297,7 +297,7 @@ def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, in
     q05, q50, q95 = _quantiles(sample, np.array([0.05, 0.5, 0.95]))
     reach = RANGE_SIGMAS / 1.645
     # A row may hold outliers, too.
-    core = np.clip(sample, q50 - reach * max(q50 - q05, 1.0), q50 + reach * max(q95 - q50, 1.0))
+    core = np.clip(sample, q50 - 0.5 * reach * max(q50 - q05, 1.0), q50 + 0.5 * reach * max(q95 - q50, 1.0))
     sigma = max(float(np.sqrt(np.median(core.var(-1)))), 0.5)
     low = int(max(q50 - reach * max(q50 - q05, sigma), 1))  # code 0 is always in the first, open bin
     high = int(q50 + reach * max(q95 - q50, sigma)) + 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+import tifffile
 
 import hsnoise
 from hsnoise._arguments import warn_of_a_mosaic
@@ -62,3 +63,13 @@ def test_copies_are_told_across_exposures_too():
     frames = darks()
     with pytest.raises(ValueError, match=r"frame 0 of the 0.1 s exposure and frame 0 of the 0.2 s exposure are ident"):
         hsnoise.fit(hsnoise.FrameStack([frames, frames], [0.1, 0.2], cfa="RGGB"))
+
+
+def test_exposures_are_told_beside_their_files_in_the_order_of_decimals(tmp_path, capsys):
+    for exposure_s in (0.05, 0.1, 0.4):
+        tifffile.imwrite(tmp_path / f"dark_{exposure_s}s.tif", darks(exposure_s).astype(np.uint16))
+    folder = str(tmp_path)
+    main(["compare", folder, "--model", "canon_5d3", "--exposure", "0.05,0.1,0.4", "--out", f"{folder}/out"])
+    told = [line for line in capsys.readouterr().err.splitlines() if "dark_" in line and " s: " in line]
+    assert [line.split(" s: ")[0] for line in told] == ["0.05", "0.1", "0.4"]
+    assert all(f"dark_{line.split(' s: ')[0]}s.tif" in line and "mean" in line for line in told)
