@@ -28,7 +28,7 @@ def test_bins_are_those_of_the_others_and_the_law_that_of_the_outliers(share):
     clean, dirty = (summarise(capture(s)) for s in (0.0, share))
     for one, other in zip(clean.histograms, dirty.histograms, strict=True):
         assert np.abs(one.edges_dn[:, 0] - other.edges_dn[:, 0]).max() <= 2
-        assert (np.diff(other.edges_dn)[:, 0] <= np.diff(one.edges_dn)[:, 0] + 2).all()  # not thousands
+        assert (np.diff(other.edges_dn)[:, 0] <= 3 * np.diff(one.edges_dn)[:, 0]).all()  # not a thousand times
         assert (one.outlier_law[:, -1] < 0.2).all() and (other.outlier_law[:, -1] > 0.9).all()
         np.testing.assert_allclose(other.outlier_law.sum(1), 1.0)
     assert (far_outliers(clean) == 0).all()
