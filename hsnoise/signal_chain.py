@@ -11,7 +11,7 @@ import numpy as np
 
 from hsnoise._keys import named_key
 from hsnoise.arrivals import Arrivals
-from hsnoise.effects import AbstractEffect
+from hsnoise.effects import AbstractEffect, Stage
 
 
 def apply_by_effect(key, light, shape, effects, capture):
@@ -41,7 +41,7 @@ def signals(key, light, shape, effects, capture):
             raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
         if jnp.iscomplexobj(drawn):
             raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
-        if jnp.issubdtype(drawn.dtype, jnp.integer) and effect is not effects[-1]:
+        if jnp.issubdtype(drawn.dtype, jnp.integer) and effect.acts_at < Stage.DIGITAL:
             drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; those after it expect floats
         signal = drawn
         yield effect, signal

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import numpy as np
 import pytest
@@ -73,3 +75,21 @@ def test_exposures_are_told_beside_their_files_in_the_order_of_decimals(tmp_path
     told = [line for line in capsys.readouterr().err.splitlines() if "dark_" in line and " s: " in line]
     assert [line.split(" s: ")[0] for line in told] == ["0.05", "0.1", "0.4"]
     assert all(f"dark_{line.split(' s: ')[0]}s.tif" in line and "mean" in line for line in told)
+
+
+def test_whole_electrons_of_a_users_effect_are_taken():
+    class OneMore(hsnoise.AbstractEffect):
+        name: ClassVar[str] = "one_more"
+        stage: ClassVar[hsnoise.Stage] = hsnoise.Stage.ELECTRONS
+
+        def sample(self, signal, capture, *, key):
+            return signal.astype(int) + 100
+
+    model = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    plain, more = (
+        np.asarray(hsnoise.sample_dark(jax.random.key(0), 1, (32, 32), m)).astype(float)
+        for m in (model, model.add(OneMore()))
+    )
+    assert more.mean() - plain.mean() == pytest.approx(
+        100 * np.asarray(model["gain"].value)[[0, 1, 1, 2]].mean(), rel=0.05
+    )
