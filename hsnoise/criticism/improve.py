@@ -31,8 +31,10 @@ MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
+LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 MOVED_SIGMA = 2.0
+FINISHED = "Nothing significant is left"
 UNFINISHED = "Not finished: whether something is missing was being looked for."
 
 
@@ -77,6 +79,11 @@ class Story:
     @property
     def params(self) -> NoiseModel:
         return self.fit.params
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing significant was left at the end."""
+        return self.ended.startswith(FINISHED)
 
     @property
     def start(self) -> str:
@@ -136,8 +143,9 @@ def improve(
         stack: FrameStack, or a bare array with FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
-        seed: of all draws. progress: called with a sentence at each stage. keep: called with the story so far, after
-            each model that is kept, so that nothing is lost.
+        seed: of all draws. progress: called with a sentence at each stage, and again, with a colon and a number behind
+            it, after each capture that is drawn. keep: called with the story so far, after each model that is kept, so
+            that nothing is lost.
 
     Raises:
         TypeError, ValueError: bad input, before any long work.
@@ -159,6 +167,8 @@ def improve(
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000, progress=tick)
         steps[-1] = last = replace(last, diagnosis=found)
         nearest = _nearest(found)
+        if nearest and _is_too_little(nearest, steps):
+            return Story(tuple(steps), _would_be_next(nearest[0], last.comparison), split)
         if not nearest:
             return Story(tuple(steps), _end(found, last.comparison), split)
         for candidate in nearest:
@@ -281,6 +291,18 @@ def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
     return effect, replace(effect, **{"after_gain": not effect.after_gain})
 
 
+def _is_too_little(nearest: tuple[Candidate, ...], steps: list[Step]) -> bool:
+    """Whether a further effect is too weak, beside those that were chosen from the same frames, where all fits."""
+    return len(steps) > 1 and steps[-1].comparison.error <= CHANCE_ERROR and nearest[0].score < LATE_EVIDENCE
+
+
+def _would_be_next(candidate: Candidate, comparison: Comparison) -> str:
+    return (
+        f"{FINISHED} (error {comparison.error:.2f}): {candidate.name} would be next, by {candidate.score:.0f} nats, as"
+        " chance gives among so many."
+    )
+
+
 def _fit_with(effect: AbstractEffect, steps: list[Step], fitted: FrameStack, tick: Callable[[], None]) -> FitResult:
     """A fit of the last model and one effect more; it goes on from the last fit by likelihood if that holds."""
     model = steps[-1].fit.params.add(effect)
@@ -333,7 +355,7 @@ def _end(found: Diagnosis, comparison: Comparison) -> str:
     if found.verdict == "nothing missing":
         if comparison.error > CHANCE_ERROR:
             return f"No effect stands out, but something weak may be left: the error is {comparison.error:.2f}."
-        return f"Nothing significant is left (error {comparison.error:.2f})."
+        return f"{FINISHED} (error {comparison.error:.2f})."
     if found.names:
         return f"Still {found.headline}, but no refit with it held (error {comparison.error:.2f})."
     advice = f": {found.advice}" if found.advice else ""

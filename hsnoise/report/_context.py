@@ -90,7 +90,7 @@ def is_good(found: Comparison | Diagnosis | Story) -> bool:
         return found.p_value > CHANCE and found.error < CLEAR
     if isinstance(found, Story):
         last = found.steps[-1].diagnosis
-        return last is not None and last.verdict == "nothing missing"
+        return found.finished or (last is not None and last.verdict == "nothing missing")
     return found.verdict == "nothing missing"
 
 

@@ -16,7 +16,7 @@ from hsnoise import effects as fx
 from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.improve import Step, _is_there, _Work
+from hsnoise.criticism.improve import Step, _is_there, _is_too_little, _Work
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -165,6 +165,15 @@ def test_step_compatible_with_zero_is_not_taken(sigma_e, error_e, there):
     result = SimpleNamespace(params=MODEL, names=tuple(rows), table=rows)
     assert _is_there(fx.FrameOffset(sigma_e), result) is there
     assert _is_there(fx.RowNoise(1.0), result)  # its size was not fitted: nothing speaks against it
+
+
+@pytest.mark.parametrize(
+    ("steps", "error", "score", "too_little"),
+    [(1, 0.9, 7, False), (2, 0.9, 7, True), (2, 0.9, 30, False), (2, 3.0, 7, False)],
+)
+def test_a_further_effect_needs_more_evidence(steps, error, score, too_little):
+    step = SimpleNamespace(comparison=SimpleNamespace(error=error))
+    assert _is_too_little((SimpleNamespace(score=score),), [step] * steps) is too_little
 
 
 def test_sizes_count_not_places():
