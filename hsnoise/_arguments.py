@@ -17,7 +17,7 @@ from hsnoise._frames import LazyFrames
 from hsnoise._types import Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
-MOSAIC_SIGMA, LEAST_PIXELS = 6.0, 1024
+MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
 MOST_SEED = 2**31  # those of single draws are counted from it
 
 
@@ -45,8 +45,8 @@ def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[floa
     seen: dict[bytes, tuple[int, float]] = {}
     for of_exposure, seconds in zip(prints, exposure_s, strict=True):
         for number, one in enumerate(of_exposure):
-            first, earlier = seen.setdefault(one, (number, seconds))
-            if (first, earlier) != (number, seconds):
+            if one in seen:
+                first, earlier = seen[one]
                 which = (
                     f"frames {first} and {number} of the {seconds:g} s exposure"
                     if earlier == seconds
@@ -55,6 +55,7 @@ def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[floa
                 raise ValueError(
                     f"counts: {which} are identical; a copy tells nothing of the noise, so give each frame once"
                 )
+            seen[one] = number, seconds
 
 
 def seed_of(name: str, value: Any) -> int:
@@ -105,8 +106,9 @@ def warn_of_a_mosaic(frame: np.ndarray) -> None:
     rows, columns = (size // 2 * 2 for size in frame.shape)
     if rows * columns < LEAST_PIXELS:
         return
-    pixels = frame[:rows, :columns].astype(float)
-    pixels = pixels.reshape(rows // 2, 2, columns // 2, 2)
+    blocks_of_rows = frame[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)
+    # Some of a large frame: as floats all of it would take many times its memory.
+    pixels = blocks_of_rows[:: -(-rows * columns // MOST_PIXELS)].astype(float)
     squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2
     sign = np.array([[1, -1], [-1, 1]])[None, :, None, :]
     blocks = [(sign * values).sum((1, 3)).ravel() for values in (pixels, squares)]

@@ -50,9 +50,8 @@ def _count(frame: jax.Array, bins: Bins, number: int, wide: bool) -> tuple[jax.A
     codes = frame.astype(whole).reshape(rows, columns // step, step)
     above = jnp.clip(codes, low - 1, end) - low
     share = 1 / width.astype(jnp.float64 if wide else jnp.float32)
-    at = (
-        jnp.floor((above.astype(share.dtype) + 0.5) * share).astype(jnp.int32) + 1
-    )  # many times as fast as whole numbers
+    # Many times as fast as a division of whole numbers.
+    at = jnp.floor((above.astype(share.dtype) + 0.5) * share).astype(jnp.int32) + 1
     at = jnp.where(codes >= end, number - 1, at)
     first = number * jnp.arange(rows * step, dtype=jnp.int32).reshape(rows, 1, step)
     counts = jnp.zeros(number * rows * step, jnp.int32).at[(at + first).ravel()].add(1, mode="promise_in_bounds")

@@ -75,8 +75,10 @@ def check_effects(model: NoiseModel, like: FrameStack) -> None:
     longest = int(np.argmax(like.exposure_s))
     frames, exposure_s = like.n_frames[longest], float(like.exposure_s[longest])
     gain = float(np.mean(np.asarray(model["gain"].value))) if "gain" in model else 1.0
-    largest_dn = max(float(frame.max()) for frame in like.frames(longest))
-    white_dn = max(2.0**16, largest_dn) if like.white_level is None else float(like.white_level)
+    if like.white_level is None:
+        white_dn = max(2.0**16, *(float(frame.max()) for frame in like.frames(longest)))
+    else:
+        white_dn = float(like.white_level)
     for effect, signal in dark_signals(jax.random.key(0), frames, like.shape, model, exposure_s=exposure_s):
         values = np.asarray(signal, float)
         unit, largest = ("e-", white_dn / gain) if effect.acts_at < Stage.GAIN else ("DN", white_dn)

@@ -128,8 +128,8 @@ class NoiseModel(eqx.Module):
                 parameters = effect.parameters(self.channels)
             except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
                 return head
-            units = {"1": ""}
-            lines += [f"  {p.name} = {p.value:.6g} {units.get(p.spec.unit, p.spec.unit)}".rstrip() for p in parameters]
+            of = [(p, "" if p.spec.unit == "1" else f" {p.spec.unit}") for p in parameters]
+            lines += [f"  {p.name} = {p.value:.6g}{unit}" for p, unit in of]
             chosen = effect.settings().items()
             lines += [f"  {effect.name}.{field} = {value}" for field, value in chosen if value is not None]
         return "\n".join(lines)

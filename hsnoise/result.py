@@ -128,3 +128,8 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     if digits > 6 or error >= 1e4:
         return f"{value:.3e}", f"{error:.1e}"
     return f"{value:.{digits}f}", f"{error:.{digits}f}"
+
+
+def number(value: float) -> str:
+    """Three digits, without exponent up to a million."""
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 import hsnoise
-from hsnoise._arguments import warn_of_a_mosaic
+from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
 from hsnoise.cli import main
 
 
@@ -93,3 +93,8 @@ def test_whole_electrons_of_a_users_effect_are_taken():
     assert more.mean() - plain.mean() == pytest.approx(
         100 * np.asarray(model["gain"].value)[[0, 1, 1, 2]].mean(), rel=0.05
     )
+
+
+def test_copies_are_told_in_groups_of_one_exposure():
+    with pytest.raises(ValueError, match=r"frames 0 and 0 of the 0.1 s exposure are identical"):
+        check_no_copies([[b"one", b"two"], [b"one", b"three"]], [0.1, 0.1])

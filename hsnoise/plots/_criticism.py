@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
+from hsnoise.result import number
 
 MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]
@@ -24,7 +25,7 @@ def comparison(found) -> Figure:
     """
     rows = sorted(found.table, key=lambda row: -abs(row[4]))[:MOST_BARS][::-1]
     height = 0.32 * max(len(found.groups), len(rows)) + 2.0
-    figure = new_figure(11.0, height, f"Model against measurement: error {_number(found.error)}")
+    figure = new_figure(11.0, height, f"Model against measurement: error {number(found.error)}")
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.1])
     groups = sorted(found.groups.items(), key=lambda item: item[1])
     misfits, own = np.array([misfit for _, misfit in groups]), found.own_misfit
@@ -43,14 +44,10 @@ def comparison(found) -> Figure:
     z = np.array([row[4] for row in rows])
     right.barh([row[0] for row in rows], z, color=_colours(np.abs(z) > NOTABLE_Z))
     _wide_scale(right)
-    right.set_xlabel("(measured - model) / σ of its own samples\n(orange: beyond 4)")
+    right.set_xlabel("(measured - model) / σ of draws\n(orange: beyond 4)")
     right.set_title("statistics that are furthest off", fontsize=10)
     tidy(right)
     return figure
-
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _colours(alarming: np.ndarray) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult, rounded
+from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack
 from hsnoise.structure import explained
 
@@ -180,8 +180,3 @@ def _why(before: Step) -> list[str]:
 def _gain(before: Step, after: Step) -> str:
     change = after.held_out - before.held_out
     return f"{change:+.1f} nats" if np.isfinite(change) else ""
-
-
-def number(value: float) -> str:
-    """Three digits, without exponent up to a million."""
-    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
