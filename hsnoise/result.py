@@ -124,7 +124,7 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
     if not (np.isfinite(error) and error > 0):
         return f"{value:.5g}", "given" if error == 0 else "not determined"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
+    digits = max(1 if 0 < abs(value) < 10 else 0, 1 - int(np.floor(np.log10(error))))
     if digits > 6 or error >= 1e4:
         return f"{value:.3e}", f"{error:.1e}"
     return f"{value:.{digits}f}", f"{error:.{digits}f}"

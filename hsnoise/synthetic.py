@@ -20,7 +20,7 @@ from hsnoise.coordinates import Coordinates, coordinates_for
 from hsnoise.draws import black_level_of, draw_capture, floored_variance, part_of
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
-from hsnoise.physics import Physics
+from hsnoise.physics import Physics, physics_of
 from hsnoise.plan import plan_rules
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
@@ -30,6 +30,7 @@ from hsnoise.structure import structure
 COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
 MOST_SLOPES, MOST_ITERATIONS = 4, 20  # derivatives cost four times what means do, and change little near the end
 SLACK, MUCH_LESS = 0.02, 0.8  # of the cost: rare counts make it rough; a step for which old derivatives are good enough
+FAR_OFF = 5.0  # deviations from which a statistic counts less
 LEAST_DAMPING = 0.1  # of the information, once a step failed
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
@@ -41,7 +42,7 @@ OFF_BOUNDS = 0.02  # share of the range between two bounds
 SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
 SHRINKAGE, DRAWS_OF_ALL = 0.1, 10.0  # what all numbers say of the scatter of one counts as so many draws
 MARGIN = 1.15
-UNKNOWN = 1e3  # deviation of what the base fit does not know, in sizes
+UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
@@ -109,7 +110,10 @@ def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained)."""
+    """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained).
+
+    given: the model that was handed over; its base parameters are another place to start.
+    """
 
     part: FrameStack
     base: FitResult
@@ -117,6 +121,7 @@ class Problem:
     extra: tuple[str, ...]
     knobs: list[Knob]
     seed: int
+    given: NoiseModel
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -141,7 +146,10 @@ class Problem:
         covariance, unknown = self.base.covariance.copy(), ~np.isfinite(np.diagonal(self.base.covariance))
         covariance[unknown], covariance[:, unknown] = 0.0, 0.0
         covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
-        return np.linalg.eigh(covariance / slope[:, None] / slope[None, :])
+        covariance = covariance / slope[:, None] / slope[None, :]
+        # Beside a deviation of millions, one of thousandths would have no digits.
+        share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
+        return np.linalg.eigh(covariance * share[:, None] * share[None, :])
 
     @cached_property
     def whiten(self) -> np.ndarray:
@@ -176,6 +184,21 @@ class Problem:
     @property
     def start(self) -> np.ndarray:
         return np.concatenate([np.zeros(len(self.centre)), [knob.read(self.model) for knob in self.knobs]])
+
+    @property
+    def other_start(self) -> np.ndarray | None:
+        """Where the base parameters are those of `model`, which may know more of the effects than `base` did."""
+        own = NoiseModel(
+            [self.given[name] for name in self.base.params.names],
+            cfa=self.given.cfa,
+            shutter=self.given.shutter,
+            exposure_s=self.given.exposure_s,
+        )
+        with jax.enable_x64(True):
+            vector = np.asarray(self.coordinates.vector(physics_of(own)))
+        if not np.all(np.isfinite(vector)) or np.allclose(vector, self.centre, rtol=1e-6):
+            return None
+        return np.concatenate([np.linalg.solve(self.whiten, vector - self.centre), self.start[len(vector) :]])
 
     def physics(self, y: np.ndarray) -> Physics:
         n = len(self.centre)
@@ -236,55 +259,69 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     part, tick = part_of(stack), progress or (lambda: None)
     extra = tuple(name for name in model.names if name not in base.params)
     whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
-    problem = Problem(part, base, whole, extra, knobs(whole, extra), seed)
+    problem = Problem(part, base, whole, extra, knobs(whole, extra), seed, model)
     return _result(problem, *_search(problem, tick))
 
 
 @dataclass(frozen=True)
 class _Point:
-    """Statistics of draws at y [draw, statistic], and how far they are from the measured ones, the prior included."""
+    """Statistics of draws at y [draw, statistic], and how far the measured ones are off [statistic], in deviations."""
 
     y: np.ndarray
     drawn: np.ndarray
-    cost: float
+    off: np.ndarray
 
 
 def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
 
-    Gauss-Newton, with Levenberg's damping where a step leads away.
+    Gauss-Newton, with Levenberg's damping where a step leads away. Statistics that are far off count less (Huber): what
+    the model still lacks must not bend what it can describe.
     """
     measured, _ = problem.statistics(problem.part)
-    scale, weight, scattered = _weights(problem, problem.start, tick)
+    scale, equal, scattered = _weights(problem, problem.start, tick)
     prior = problem.prior
 
     def point(y: np.ndarray) -> _Point:
         drawn = _draws(problem, y, tick)
-        off = (measured - drawn.mean(0)) / scale
-        return _Point(y, drawn, float(off @ weight @ off + prior @ (y - problem.start) ** 2))
+        return _Point(y, drawn, (measured - drawn.mean(0)) / scale)
+
+    def cost(of: _Point) -> float:
+        return float(of.off @ weight @ of.off + prior @ (of.y - problem.start) ** 2)
 
     here, damping, taken, wanted, fresh, iterations = point(problem.start), 0.0, 0, True, False, 0
+    if problem.other_start is not None:
+        other = point(problem.other_start)
+        here = min(here, other, key=lambda of: np.minimum(np.abs(of.off), FAR_OFF) @ np.abs(of.off))
     by = np.where(np.arange(len(here.y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
     while iterations < MOST_ITERATIONS:
         iterations += 1
+        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(here.off), 1e-12)))
+        weight = share[:, None] * equal * share
         if wanted:
             slopes = _slopes(problem, here.y, by, here.drawn, tick) / scale[:, None]
-            information = slopes.T @ weight @ slopes + np.diag(prior)
-            covariance, gain = np.linalg.inv(information), slopes.T @ weight
-            by, taken = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance))), taken + 1
-            fresh = True
-        uphill = gain @ ((measured - here.drawn.mean(0)) / scale) - prior * (here.y - problem.start)
+            taken, fresh, of = taken + 1, True, here.y
+        gain = slopes.T @ weight
+        information = gain @ slopes + np.diag(prior)
+        covariance = np.linalg.inv(information)
+        by = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance)))
+        uphill = gain @ here.off - prior * (here.y - problem.start)
         length = float(np.abs(covariance @ uphill / np.sqrt(np.diagonal(covariance))).max())
         if not np.isfinite(length):
             raise RuntimeError(_not_finite(problem, here.y))
         step = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), uphill)
         ahead = here.y + step * problem.share_of(step)
+        gone = float(np.abs((here.y - of) / np.sqrt(np.diagonal(covariance))).max())
+        if length < SHORT_STEP and gone > SURE_STEP and taken < 2 * MOST_SLOPES:
+            wanted = True  # derivatives of another place would end the search where they are not those of here
+            continue
         if length < SHORT_STEP:
             here = replace(here, y=ahead)
             break
         there = point(ahead)
-        if there.cost < (1 + SLACK) * here.cost + 1:
-            most = MOST_SLOPES if there.cost < MUCH_LESS * here.cost else 2 * MOST_SLOPES
+        before, after = cost(here), cost(there)
+        if after < (1 + SLACK) * before + 1:
+            most = MOST_SLOPES if after < MUCH_LESS * before else 2 * MOST_SLOPES
             wanted = length >= SURE_STEP and taken < most
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:

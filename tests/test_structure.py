@@ -13,6 +13,7 @@ import hsnoise
 from hsnoise.effects import (
     AmplifierGlow,
     BlackClamp,
+    BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
     CosmicRays,
@@ -33,7 +34,8 @@ from hsnoise.effects import (
     SharedRowGain,
     TapOffsets,
 )
-from hsnoise.structure import _anova, code_step, moving_line, structure
+from hsnoise.model import NoiseModel
+from hsnoise.structure import _anova, code_step, moving_line, places, structure
 
 SHAPE, FRAMES, EXPOSURE_S = (96, 128), 6, (0.01, 0.03, 0.1, 0.2)
 CLEAN = 12
@@ -63,6 +65,7 @@ NOTHING = (
     ImageLag(0.0),
     OddEvenPattern(0.0),
     TapOffsets(0.0, taps=4),
+    BlackShading(0.0, 0.4),
     MissingCodes(1.0),
     CosmicRays(0.0, 1.0),
     BlackClamp([0.0, 0.0, 0.0]),
@@ -217,6 +220,7 @@ REACTIONS = [
     (ImageLag(0.1), "pixels over time: residual, next frame, long exposures", 1),
     (OddEvenPattern(1.0), "static columns: parity, short exposures", 1),
     (TapOffsets(1.0, taps=4), "static columns: steps of 8, short exposures", 1),
+    (BlackShading(1.0, 0.4), "static columns: low-order shape, short exposures", 1),
     (MissingCodes(1.7), "codes: roughness of the histogram, long exposures", 1),
     (CosmicRays(1500.0, 500.0), "pixels over time: pixels with 1 outliers", 1),
     (BlackClamp([70.0, 60.0, 65.0]), "level: mean above black, DN, G, long exposures", -1),
@@ -250,6 +254,42 @@ def test_the_strongest_line_is_found_to_a_part_of_a_cycle(cfa, axis, frequency, 
     found = moving_line(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=64.0, cfa=cfa), draws, np.array(64.0))
     assert found[0] == axis
     assert abs(found[1] - frequency) < 0.15 / n
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("spot", [(0.0, 1.0), (1.0, 0.0), (0.5, 0.0), (1.0, 0.5)])
+def test_a_glow_is_found_in_its_corner_beside_hot_pixels(cfa, spot, rng):
+    capture = noise(rng, (4, 4), (96, 128), cfa, sigma=8.0)
+    r, c = np.mgrid[:96, :128]
+    far = np.hypot(r - spot[0] * 95, c - spot[1] * 127) / np.hypot(96, 128)
+    light = 12 * np.exp(-far / 0.25) + 300 * (rng.random((96, 128)) < 0.01)
+    counts = [np.rint(capture.counts[i] + share * light).astype(np.uint16) for i, share in enumerate((0.1, 1.0))]
+    assert places(hsnoise.FrameStack(counts, (0.01, 0.1), black_level=64.0, cfa=cfa)).glow == spot
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_chain_that_reads_more_is_found(cfa, sign, rng):
+    capture = noise(rng, (4, 4), (96, 128), cfa, sigma=8.0)
+    model = NoiseModel([OddEvenPattern(sign * 1.0)], cfa=cfa, shutter="global", exposure_s=0.1)
+    drawn = np.asarray(hsnoise.sample_dark(jax.random.key(0), 1, (96, 128), model))
+    counts = [np.rint(frames + drawn).astype(np.uint16) for frames in capture.counts]
+    assert places(hsnoise.FrameStack(counts, (0.01, 0.1), black_level=64.0, cfa=cfa)).second_chain == sign
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("axis", ["row", "column"])
+@pytest.mark.parametrize(("start", "above"), [("first", True), ("first", False), ("last", True)])
+def test_shading_is_found_with_its_side_and_direction(cfa, axis, start, above, rng):
+    capture = noise(rng, (4, 4), (94, 110), cfa, sigma=8.0)
+    n = capture.shape[0 if axis == "row" else 1]
+    bent = np.exp(-np.arange(n) / (0.1 * n))[:: 1 if start == "first" else -1]
+    bent = 8 * bent * (1 if above else -1)
+    bent = bent[:, None] if axis == "row" else bent[None]
+    counts = [np.rint(capture.counts[i] + bent).clip(0).astype(np.uint16) for i in range(2)]
+    found = places(hsnoise.FrameStack(counts, (0.01, 0.02), black_level=64.0, cfa=cfa)).shading
+    assert found[:3] == (axis, start, above)
+    assert 0.05 < found[3] < 0.2
 
 
 def test_a_weak_line_is_found_beside_the_alternation_of_colours():

@@ -70,7 +70,7 @@ def hidden():
 def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
     stack, base = hidden
     model = base.params.add(RowNoise(1.4))
-    problem = Problem(stack, base, model, ("row_noise",), knobs(model, ("row_noise",)), 0)
+    problem = Problem(stack, base, model, ("row_noise",), knobs(model, ("row_noise",)), 0, model)
     # Parameters that are known to a few per cent, whatever coordinates stand for them.
     assert np.all(problem.prior[: len(base.names)] < 1e-3)
     steps = problem.slope(problem.centre)[:, None] * problem.whiten
@@ -116,7 +116,7 @@ def test_what_an_effect_holds_is_no_knob():
 class Bent:
     """A problem whose statistics are arcs of the first number: Newton's steps from far away lead further away."""
 
-    part, knobs, centre = None, (), np.zeros(0)
+    part, knobs, centre, other_start = None, (), np.zeros(0), None
     start, truth, prior = np.array([2.5, 0.3]), np.array([0.2, -0.1]), np.full(2, 1e-6)
 
     def draw(self, y, number):

@@ -16,9 +16,11 @@ from hsnoise.draws import black_level_of, draw_capture, light_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
-from hsnoise.structure import code_step, moving_line
+from hsnoise.structure import Places, code_step, moving_line, places
 
 LEAST_ELECTRONS = 0.2
+FROM_FRAME_TO_FRAME = ("image_lag", "dark_current_drift", "frame_offset", "black_shading")  # not told by one frame
+SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
 LINE_SEEDS = range(7000, 7006)  # of draws without lines of their own
 
 Maker = Callable[[float, np.random.Generator], AbstractEffect]
@@ -28,7 +30,9 @@ Maker = Callable[[float, np.random.Generator], AbstractEffect]
 class Scale:
     """What amplitudes are measured by: read noise e-, longest exposure s, dark current e-/s, gain DN/e-, frames.
 
-    line: axis and frequency of the strongest line in the capture. step: distance of its codes, None if all occur.
+    has_bias: whether an exposure is short enough to tell what happens while a frame waits to be read. line: axis and
+    frequency of the strongest line in the capture. places: where its patterns lie. step: distance of its codes, None if
+    all occur.
     """
 
     read_noise: float
@@ -37,9 +41,11 @@ class Scale:
     gain: np.ndarray
     frames: int
     has_exposure: bool
+    has_bias: bool
     exposures_differ: bool  # of the darks
     light: float  # most photoelectrons of a flat, e-
     line: tuple[str, float]
+    places: Places
     step: float | None
 
     @staticmethod
@@ -53,9 +59,11 @@ class Scale:
             gain=np.asarray(model["gain"].value, float),
             frames=max(part.n_frames[i] for i in darks),
             has_exposure=longest > 0,
+            has_bias=min(float(part.exposure_s[i]) for i in darks) < SHORT_SHARE * longest,
             exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
             line=moving_line(part, [draw_capture(s, model, part) for s in LINE_SEEDS], black_level_of(model)),
+            places=places(part),
             step=code_step(part),
         )
 
@@ -64,10 +72,9 @@ def built_in(model: NoiseModel, part: FrameStack) -> dict[str, Maker]:
     """Effects that a capture can show and that the model does not have: name to maker from amplitude and generator."""
     scale = Scale.of(model, part)
     makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, part.shutter), **_of_signal(scale)}
-    if scale.has_exposure:
-        makers |= _dark_signal(scale)
+    makers |= _dark_signal(scale) if scale.has_exposure else _bias_frames(scale)
     if scale.frames < 2:
-        makers = {n: m for n, m in makers.items() if n not in ("image_lag", "dark_current_drift", "frame_offset")}
+        makers = {n: m for n, m in makers.items() if n not in FROM_FRAME_TO_FRAME}
     return {name: maker for name, maker in makers.items() if name not in model}
 
 
@@ -93,6 +100,12 @@ def _behind(rng: np.random.Generator) -> bool:
 
 def _read_out(s: Scale) -> dict[str, Maker]:
     read = s.read_noise
+
+    def shade(f: float, rng: np.random.Generator) -> AbstractEffect:
+        axis, start, above, length = s.places.shading
+        size = 0.2 * f * read * float(s.gain.mean())
+        return fx.BlackShading(size, length * np.exp(rng.uniform(-0.7, 0.7)), axis, start, above)
+
     return {
         "row_noise": lambda f, rng: fx.RowNoise(0.25 * f * read, rng.choice([0.0, 1.0]), _behind(rng)),
         "column_noise": lambda f, rng: fx.ColumnNoise(0.25 * f * read, rng.choice([0.0, 1.0]), _behind(rng)),
@@ -101,8 +114,9 @@ def _read_out(s: Scale) -> dict[str, Maker]:
         "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read, _behind(rng)),
         "periodic_banding": lambda f, rng: fx.PeriodicBanding(0.3 * f * read, s.line[1], s.line[0], _behind(rng)),
         "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
-        "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * rng.choice([-1, 1]), 0.0),
+        "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * s.places.second_chain, 0.0),
         "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, int(rng.choice([2, 4, 8])), _behind(rng)),
+        "black_shading": shade,
         "missing_codes": lambda f, rng: fx.MissingCodes(s.step or 1.0 + min(f, 1.0) * rng.uniform(0.1, 1.5)),
     }
 
@@ -122,16 +136,28 @@ def _pixels(s: Scale, shutter: str) -> dict[str, Maker]:
     }
 
 
+def _hot_electrons(s: Scale, rng: np.random.Generator) -> float:
+    return np.exp(rng.uniform(np.log(4), np.log(120))) * s.read_noise
+
+
+def _bias_frames(s: Scale) -> dict[str, Maker]:
+    """What pixels collect while frames without exposure wait to be read."""
+    return {
+        "hot_pixels": lambda f, rng: fx.HotPixels(min(0.003 * f, 0.2), 0.0, _hot_electrons(s, rng)),
+        "cosmic_rays": lambda f, rng: fx.CosmicRays(0.0, rng.uniform(15, 80) * s.read_noise, 40.0 * f),
+    }
+
+
 def _dark_signal(s: Scale) -> dict[str, Maker]:
     def spot(f: float, rng: np.random.Generator) -> AbstractEffect:
-        row, column = rng.choice([0.0, 0.5, 1.0]), rng.choice([0.0, 1.0])
+        row, column = s.places.glow
         peak = 0.8 * f * max(s.read_noise, np.sqrt(s.rate * s.longest_s))
         return fx.AmplifierGlow(peak / s.longest_s, rng.uniform(0.15, 0.5), row, column, rng.choice([0.7, 1.0, 1.5]))
 
     def hot(f: float, rng: np.random.Generator) -> AbstractEffect:
-        return fx.HotPixels(
-            min(0.003 * f, 0.2), np.exp(rng.uniform(np.log(4), np.log(120))) * s.read_noise / s.longest_s
-        )
+        rate = _hot_electrons(s, rng) / s.longest_s
+        at_readout = rng.choice([0.0, 0.01]) * rate * s.longest_s if s.has_bias else 0.0
+        return fx.HotPixels(min(0.003 * f, 0.2), rate, at_readout)
 
     def cosmic(f: float, rng: np.random.Generator) -> AbstractEffect:
         at_readout = rng.choice([0.05, 0.5, 0.95])  # of the hits in the longest exposure

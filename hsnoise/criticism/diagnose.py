@@ -24,7 +24,7 @@ from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pairs, closest, judge
 from hsnoise.criticism.reference import measure, reference
-from hsnoise.criticism.refine import refined, refined_pair
+from hsnoise.criticism.refine import refined, refined_pair, score_with_base
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -249,16 +249,16 @@ def _drawn_close(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> Ju
 
 
 def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
-    """The first candidate before or behind the gain, where it describes the capture better with parameters close to it.
+    """The first candidate before or behind the gain, where it describes the capture better, the base fitted to it.
 
-    Among random details the side goes with what else was drawn, and a wrong one is left in the statistics.
+    Among random details the side goes with what else was drawn; on a base that the effect has bent, they differ little.
     """
     first = judged[0]
     effect = first.candidate(evidence).effect
     if first.score <= EVIDENCE or not hasattr(effect, "after_gain"):
         return judged
-    sides = [_drawn_close(replace(effect, **{"after_gain": side}), bench, evidence) for side in (False, True)]
-    closer = max(sides, key=lambda one: one.score)
+    sides = [replace(effect, **{"after_gain": side}) for side in (False, True)]
+    closer = _drawn_close(max(sides, key=lambda one: score_with_base(one, bench, evidence)), bench, evidence)
     # Scores of many draws are lower: rare counts seem to scatter less in few. Far lower, the search has gone astray.
     return _best_first([closer if closer.score > NEAR * first.score else first, *judged[1:]])
 

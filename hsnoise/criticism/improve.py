@@ -222,7 +222,11 @@ class _Work:
 def _size(result: FitResult, name: str) -> list[str]:
     """What was fitted of an effect that was added, and what was chosen for it, in words."""
     rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
-    told = [f"{n} = {' ± '.join(rounded(value, error))}{'' if u == '1' else f' {u}'}" for n, (value, error, u) in rows]
+    told = []
+    for label, (value, error, unit) in rows:
+        size, of = rounded(value, error)
+        of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
+        told.append(f"{label} = {size} {of}{'' if unit == '1' else f' {unit}'}")
     chosen = result.params[name].settings().items()
     told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
     return [f"{sentence}." for sentence in told]

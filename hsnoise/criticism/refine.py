@@ -10,6 +10,7 @@ import numpy as np
 
 from hsnoise._threads import in_threads
 from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench, law_of
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -18,7 +19,11 @@ from hsnoise.synthetic import Knob, knobs
 ITERATIONS = 3
 DRAWS, SLOPE_DRAWS, PAIR_DRAWS = 6, 3, 12
 STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
-PRIOR_SIGMA = 1.0
+PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
+MANY_DRAWS = 24
+NEARBY_ERROR = 0.02  # of shifts close to the capture
+FAR_OFF = 5.0  # deviations from which a statistic counts less
+TINY = 1e-3  # a parameter of the base that is zero
 
 
 def refined(effects: Sequence[AbstractEffect], bench: Bench, evidence: Evidence) -> tuple[AbstractEffect, ...]:
@@ -48,6 +53,48 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
     score = evidence.score(law)
     again = replace(pair, effects=(effects[0], effects[1]), score=score, misfit=evidence.misfit(law), law=law)
     return max(pair, again, key=lambda one: one.score)
+
+
+def score_with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> float:
+    """Log-likelihood ratio of an effect whose parameters, and those of the base, were brought close to the capture.
+
+    Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
+    no evidence that there is the effect at all: nothing of the base is held against it.
+    """
+    own = shrunk(bench.base.own_z(), np.zeros((1, len(evidence.z)))).covariance
+    model = bench.model.add(effect)
+    numbers = knobs(model, (effect.name,)), _base_knobs(model)
+    turned = [*numbers[0], *numbers[1]]
+    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in numbers]) ** -2
+    start = y = np.array([knob.read(model) for knob in turned])
+    for _ in range(ITERATIONS):
+        shifts, slopes = _shifts_and_slopes(model, turned, y, bench)
+        law = _law_nearby(shifts, own)
+        off = evidence.z - law.mean
+        far = np.abs(off) / np.sqrt(np.diagonal(law.covariance))
+        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(far, 1e-12)))
+        weighted = slopes.T @ (share[:, None] * np.linalg.inv(law.covariance) * share)
+        step = np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * (y - start))
+        y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
+    there = _at(model, turned, y)
+    shifts = np.stack(in_threads(lambda number: bench.shift(there, number), range(MANY_DRAWS), bench.tick))
+    return evidence.score(_law_nearby(shifts, own))
+
+
+def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
+    """Law of the statistics around draws with these shifts [draw, statistic]; own: covariance of a model's draws."""
+    mean = shifts.mean(0)
+    return Gaussian(mean, own * (1 + 1 / len(shifts)) + np.diag((NEARBY_ERROR * mean) ** 2))
+
+
+def _base_knobs(model: NoiseModel) -> list[Knob]:
+    """The base parameters that are not zero; black levels are told by the means of the counts alone."""
+    found = []
+    for name, field in (("gain", "value"), ("dark_current", "rate"), ("read_noise", "sigma"), ("row_gain", "sigma")):
+        values = np.asarray(getattr(model[name], field), float) if name in model else np.zeros(0)
+        places = [place for place in np.ndindex(values.shape) if values[place] > TINY]
+        found += [Knob(name, name, field, place, 0.0, None) for place in places]
+    return found
 
 
 def _shifts_and_slopes(

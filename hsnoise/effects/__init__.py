@@ -7,6 +7,7 @@ from hsnoise.effects.adc import ADC
 from hsnoise.effects.amplifier_glow import AmplifierGlow
 from hsnoise.effects.black_clamp import BlackClamp
 from hsnoise.effects.black_level import BlackLevel
+from hsnoise.effects.black_shading import BlackShading
 from hsnoise.effects.column_fixed_pattern import ColumnFixedPattern
 from hsnoise.effects.column_noise import ColumnNoise
 from hsnoise.effects.cosmic_rays import CosmicRays
@@ -63,6 +64,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ImageLag,
     OddEvenPattern,
     TapOffsets,
+    BlackShading,
     MissingCodes,
     CosmicRays,
     BlackClamp,
@@ -75,6 +77,7 @@ __all__ = [
     "AmplifierGlow",
     "BlackClamp",
     "BlackLevel",
+    "BlackShading",
     "Capture",
     "ColumnFixedPattern",
     "ColumnNoise",

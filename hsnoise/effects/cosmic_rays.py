@@ -26,9 +26,11 @@ class CosmicRays(AbstractEffect):
     name: ClassVar[str] = "cosmic_rays"
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
-    rate: Scalar = param("1/(Mpixel s)", low=0, doc="hits of a million pixels in a second")
+    rate: Scalar = param("1/(Mpixel s)", low=0, held="at bounds", doc="hits of a million pixels in a second")
     charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
-    at_readout: Scalar = param("1/Mpixel", low=0, default=0.0, doc="hits of a million pixels whatever the exposure")
+    at_readout: Scalar = param(
+        "1/Mpixel", low=0, default=0.0, held="at bounds", doc="hits of a million pixels whatever the exposure"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, again, how_much = jax.random.split(key, 3)

@@ -12,12 +12,14 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, 
 
 
 class HotPixels(AbstractEffect):
-    """Extra dark electrons, Poisson(rate_i * exposure), in a fraction of the pixels, the same in all frames.
+    """Extra dark electrons, Poisson(rate_i * exposure + at_readout_i), in a fraction of the pixels, always the same.
 
     Defects of the silicon, many by radiation, generate charge. Every pixel is hot with probability `fraction`,
-    independently; the rates of hot pixels are exponentially distributed with mean `rate`.
+    independently; the rates of hot pixels are exponentially distributed with mean `rate`. They go on while a frame
+    waits to be read, for the same time in each: `at_readout` is in proportion to the rate.
 
-    In dark frames: bright dots at fixed places that grow in proportion to exposure, each with its own shot noise.
+    In dark frames: bright dots at fixed places that grow with exposure, each with its own shot noise, and of slow
+    sensors fainter in bias frames, too.
 
     Reference: Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE Trans. Nucl. Sci. 43, 1996.
     """
@@ -26,12 +28,15 @@ class HotPixels(AbstractEffect):
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that are hot")
-    rate: Scalar = param("e-/s", low=0, doc="mean extra dark current of a hot pixel")
+    rate: Scalar = param("e-/s", low=0, held="at bounds", doc="mean extra dark current of a hot pixel")
+    at_readout: Scalar = param(
+        "e-", low=0, default=0.0, held="at bounds", doc="mean extra electrons of a hot pixel whatever the exposure"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(capture.fixed_key(self.name))
         shape = (1, *signal.shape[1:])
         hot = jax.random.uniform(where, shape, signal.dtype) < self.fraction
-        rates = self.rate * jax.random.exponential(how_much, shape, signal.dtype)
-        mean = jnp.where(hot, rates * capture.exposure_s, 0)
+        strength = jax.random.exponential(how_much, shape, signal.dtype)
+        mean = jnp.where(hot, strength * (self.rate * capture.exposure_s + self.at_readout), 0)
         return signal + draw_poisson(key, mean, signal.shape)

@@ -16,9 +16,10 @@ from hsnoise.stack import FrameStack
 from hsnoise.structure import _lines, _pixels, _views
 from hsnoise.structure._anova import Exposure, Layout, check_size, layout_of, read_exposure
 from hsnoise.structure._codes import code_step
+from hsnoise.structure._places import Places, places
 from hsnoise.structure._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "structure"]
+__all__ = ["Places", "SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from hsnoise.effects import (
     AmplifierGlow,
     BlackClamp,
     BlackLevel,
+    BlackShading,
     Capture,
     ColumnFixedPattern,
     ColumnNoise,
@@ -85,6 +86,7 @@ EXAMPLES = [
     ImageLag(0.1),
     OddEvenPattern(1.0, 0.02),
     TapOffsets(2.0, taps=3),
+    BlackShading(2.0, 0.4),
     MissingCodes(2.6),
     CosmicRays(5e6, 300.0),
     BlackClamp([70.0, 60.0, 65.0]),
@@ -99,6 +101,7 @@ DETERMINISTIC = (
     | ReadoutBandwidth
     | ImageLag
     | OddEvenPattern
+    | BlackShading
     | MissingCodes
     | BlackClamp
     | Nonlinearity

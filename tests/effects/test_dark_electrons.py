@@ -42,6 +42,10 @@ def test_hot_pixels_are_few_exponential_and_poisson():
     longer = darks(HotPixels(0.05, 4e4), 20, (80, 80), exposure_s=1.0).mean(0)
     np.testing.assert_array_equal(longer > 0, hot)
     np.testing.assert_allclose(longer.sum() / means.sum(), 2, atol=0.01)
+    bias = darks(HotPixels(0.05, 4e4, 2e3), 20, (80, 80), exposure_s=0.0).mean(0)
+    np.testing.assert_array_equal(bias > 0, hot & (bias > 0))
+    assert abs(bias.sum() - longer.sum() / 20) < 5 * np.sqrt(bias.sum() / 20)  # the same strengths, 1/20 of the charge
+    assert np.corrcoef(bias[hot], longer[hot])[0, 1] > 0.99
 
 
 @pytest.mark.parametrize("corner", [None, (0.0, 0.0), (0.0, 1.0), (0.5, 0.25)])

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from hsnoise.effects import (
+    BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
     DarkSignalNonuniformity,
@@ -97,7 +98,26 @@ def test_banding_is_a_sinusoid_of_new_phase(axis):
     assert stats.kstest(phase, "uniform").pvalue > P_VALUE
 
 
+@pytest.mark.parametrize("length", [0.1, 0.6, 1e4])
+@pytest.mark.parametrize(("axis", "start", "above"), [("column", "first", True), ("row", "last", False)])
+def test_shading_decays_from_one_side(length, axis, start, above):
+    drawn = darks(BlackShading(2.0, length, axis, start, above), 2, (40, 60))
+    lines = drawn[0, 0] if axis == "column" else drawn[0, :, 0]
+    lines = lines if start == "first" else lines[::-1]
+    there = drawn[:1, :1] if axis == "column" else drawn[:1, :, :1]
+    np.testing.assert_array_equal(drawn, np.broadcast_to(there, drawn.shape))
+    # float32 keeps seven digits of a decay of 1e-4
+    np.testing.assert_allclose([lines.mean(), lines.std()], [0, 2], atol=1e-3)
+    steps = np.diff(lines)
+    assert np.all(steps < 0 if above else steps > 0)
+    ratio = np.exp(-1 / (length * (len(lines) - 1)))
+    np.testing.assert_allclose(steps[1:] / steps[:-1], ratio, rtol=0.02)
+
+
 def test_impossible_settings_are_refused():
+    for wrong in ({"axis": "x"}, {"start": "left"}, {"above": 0.5}):
+        with pytest.raises(ValueError, match=rf"black_shading.{next(iter(wrong))}: expected .* or .*, got"):
+            BlackShading(1.0, 0.5, **wrong)
     with pytest.raises(ValueError, match=r"periodic_banding.axis: expected 'row' or 'column', got 'x'"):
         PeriodicBanding(1.0, 0.1, "x")
     for taps in (1, 2.5):
