@@ -54,6 +54,7 @@ MODEST = {
     "image_lag": 0.04,
     "odd_even_pattern": 0.8,  # e-
     "tap_offsets": 0.8,  # e-
+    "black_shading": 1.5,  # DN, rms
     "missing_codes": 0.6,  # digital gain less 1
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
     "shared_row_gain": 0.12,
@@ -149,6 +150,11 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
         levels = rng.standard_normal(taps)
         levels = (levels - levels.mean()) / max(levels.std(), 0.3)
         out["offset"] = size * levels[c * taps // columns]
+    elif effect == "black_shading":
+        along = rng.choice([0, 1])
+        line = np.exp(-np.arange(shape[along]) / (rng.uniform(0.05, 1.0) * shape[along]))[:: rng.choice([-1, 1])]
+        line = rng.choice([-1, 1]) * (line - line.mean()) / line.std()
+        out["black"] = size * (line[:, None] if along == 0 else line[None])
     elif effect == "hot_pixels":
         hot = rng.random(shape) < size
         out["rate"] = hot * rng.exponential(rng.uniform(200, 800), shape)
@@ -199,7 +205,7 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     if curvature := sizes.get("nonlinearity"):
         x = np.minimum(x, 0.5 / curvature)  # level beyond its summit
         x = x - curvature * np.maximum(x, 0) ** 2
-    return _digital(camera, sizes, x * hidden.get("gain", 1.0), t, rng)
+    return _digital(camera, sizes, x * hidden.get("gain", 1.0), hidden.get("black", 0.0), t, rng)
 
 
 def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float:
@@ -221,8 +227,8 @@ def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float
     return 0.0
 
 
-def _digital(camera: Camera, sizes, x: np.ndarray, t: float, rng) -> np.ndarray:
-    """Gain, row gain, black level, codes."""
+def _digital(camera: Camera, sizes, x: np.ndarray, shading, t: float, rng) -> np.ndarray:
+    """Gain, row gain, black level and its shading, codes."""
     frames, rows, _ = x.shape
     channels = len(camera.gain)
     colour = colour_of(x.shape[1:], channels)
@@ -235,7 +241,7 @@ def _digital(camera: Camera, sizes, x: np.ndarray, t: float, rng) -> np.ndarray:
         beta = np.maximum(beta, 0) * np.maximum(1 + shared, 0)
         clamped = sizes.get("black_clamp", 0.0) * camera.gain[c] * camera.dark * t
         y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x - clamped, y)
-    counts = np.clip(np.rint(y + camera.black), 0, 65535)
+    counts = np.clip(np.rint(y + camera.black + shading), 0, 65535)
     if more := sizes.get("missing_codes"):
         counts = np.clip(np.rint(np.rint(counts / (1 + more)) * (1 + more)), 0, 65535)
     return counts.astype(np.uint16)
