@@ -33,6 +33,7 @@ LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
+CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
 MOVED_SIGMA = 2.0
 FINISHED = "Nothing significant is left"
 UNFINISHED = "Not finished: whether something is missing was being looked for."
@@ -247,7 +248,11 @@ def _is_better(step: Step, before: Step) -> bool:
     """Whether statistics, and frames that no fit has seen, fit better or as well with what was added."""
     # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
     seen = np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params)
-    return step.comparison.error <= before.comparison.error and (seen or step.held_out - before.held_out > WORSE)
+    after, until_now = step.comparison, before.comparison
+    less = sum(after.groups.values()) < sum(until_now.groups.values())
+    # The worst group may be that of another effect, which is still missing and does not stand quite still.
+    fits = after.error <= until_now.error * (CHANGE_OF_OTHERS if less else 1.0)
+    return fits and (seen or step.held_out - before.held_out > WORSE)
 
 
 def _is_there(effect: AbstractEffect, result: FitResult) -> bool:

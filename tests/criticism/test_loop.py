@@ -16,7 +16,7 @@ from hsnoise import effects as fx
 from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.improve import Step, _is_there, _is_too_little, _Work
+from hsnoise.criticism.improve import Step, _is_better, _is_there, _is_too_little, _Work
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -276,3 +276,20 @@ def test_large_captures_are_cut_but_keep_their_rows():
 def test_bad_input_is_refused(call, error, message):
     with pytest.raises(error, match=message):
         call(empty_stack(frames=2, shape=(32, 32)))
+
+
+@pytest.mark.parametrize(
+    ("groups", "held_out", "better"),
+    [
+        ({"frames": 36.0, "columns": 1.0}, 50.0, True),  # the worst group waits for another effect
+        ({"frames": 36.0, "columns": 21.0}, 50.0, False),  # nothing gained
+        ({"frames": 60.0, "columns": 1.0}, 50.0, False),  # much worse elsewhere
+        ({"frames": 30.0, "columns": 20.0}, -50.0, False),  # frames that no fit has seen fit worse
+    ],
+)
+def test_an_addition_is_judged_by_all_groups(groups, held_out, better):
+    def step(groups, held_out):
+        comparison = SimpleNamespace(error=max(groups.values()) / 2, groups=groups)
+        return Step(SimpleNamespace(params=MODEL), comparison, None, None, held_out, ())
+
+    assert _is_better(step(groups, held_out), step({"frames": 35.0, "columns": 20.0}, 0.0)) is better
