@@ -51,6 +51,7 @@ MODEST = {
     "periodic_banding": 0.8,  # e-
     "crosstalk": 0.02,
     "readout_bandwidth": 0.05,
+    "readout_overshoot": 0.04,
     "image_lag": 0.04,
     "odd_even_pattern": 0.8,  # e-
     "tap_offsets": 0.8,  # e-
@@ -202,6 +203,8 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
         x += _moving(effect, size, hidden, rng, frames, shape)
     if smear := sizes.get("readout_bandwidth"):
         x[:, :, 1:] = (1 - smear) * x[:, :, 1:] + smear * x[:, :, :-1]
+    if ahead := sizes.get("readout_overshoot"):
+        x[:, :, 1:] = (1 + ahead) * x[:, :, 1:] - ahead * x[:, :, :-1]
     if curvature := sizes.get("nonlinearity"):
         x = np.minimum(x, 0.5 / curvature)  # level beyond its summit
         x = x - curvature * np.maximum(x, 0) ** 2

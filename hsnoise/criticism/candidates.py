@@ -114,6 +114,7 @@ def _read_out(s: Scale) -> dict[str, Maker]:
         "frame_offset": lambda f, rng: fx.FrameOffset(0.12 * f * read, _behind(rng)),
         "periodic_banding": lambda f, rng: fx.PeriodicBanding(0.3 * f * read, s.line[1], s.line[0], _behind(rng)),
         "readout_bandwidth": lambda f, rng: fx.ReadoutBandwidth(0.03 * f),
+        "readout_overshoot": lambda f, rng: fx.ReadoutOvershoot(0.03 * f),
         "odd_even_pattern": lambda f, rng: fx.OddEvenPattern(0.2 * f * read * s.places.second_chain, 0.0),
         "tap_offsets": lambda f, rng: fx.TapOffsets(0.25 * f * read, int(rng.choice([2, 4, 8])), _behind(rng)),
         "black_shading": shade,

@@ -29,6 +29,7 @@ from hsnoise.effects.random_telegraph_noise import RandomTelegraphNoise
 from hsnoise.effects.read_noise import ReadNoise
 from hsnoise.effects.read_noise_nonuniformity import ReadNoiseNonuniformity
 from hsnoise.effects.readout_bandwidth import ReadoutBandwidth
+from hsnoise.effects.readout_overshoot import ReadoutOvershoot
 from hsnoise.effects.row_fixed_pattern import RowFixedPattern
 from hsnoise.effects.row_gain import RowGain
 from hsnoise.effects.row_noise import RowNoise
@@ -61,6 +62,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     PeriodicBanding,
     Crosstalk,
     ReadoutBandwidth,
+    ReadoutOvershoot,
     ImageLag,
     OddEvenPattern,
     TapOffsets,
@@ -103,6 +105,7 @@ __all__ = [
     "ReadNoise",
     "ReadNoiseNonuniformity",
     "ReadoutBandwidth",
+    "ReadoutOvershoot",
     "RowFixedPattern",
     "RowGain",
     "RowNoise",

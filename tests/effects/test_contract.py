@@ -43,6 +43,7 @@ from hsnoise.effects import (
     ReadNoise,
     ReadNoiseNonuniformity,
     ReadoutBandwidth,
+    ReadoutOvershoot,
     RowFixedPattern,
     RowGain,
     RowNoise,
@@ -83,6 +84,7 @@ EXAMPLES = [
     PeriodicBanding(2.0, 0.13),
     Crosstalk(0.03),
     ReadoutBandwidth(0.1),
+    ReadoutOvershoot(0.1),
     ImageLag(0.1),
     OddEvenPattern(1.0, 0.02),
     TapOffsets(2.0, taps=3),
@@ -99,6 +101,7 @@ DETERMINISTIC = (
     | ADC
     | Crosstalk
     | ReadoutBandwidth
+    | ReadoutOvershoot
     | ImageLag
     | OddEvenPattern
     | BlackShading

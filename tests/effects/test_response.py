@@ -21,14 +21,16 @@ from hsnoise.effects import (
     PhotoResponseNonuniformity,
     ReadNoise,
     ReadoutBandwidth,
+    ReadoutOvershoot,
     SharedRowGain,
     ShotNoise,
+    Stage,
 )
 from hsnoise.model import NoiseModel, sample
 
 KEY = jax.random.key(41)
 P_VALUE = 1e-5
-COUPLINGS = [Crosstalk(0.05), ReadoutBandwidth(0.2), ImageLag(0.2)]
+COUPLINGS = [Crosstalk(0.05), ReadoutBandwidth(0.2), ReadoutOvershoot(0.2), ImageLag(0.2)]
 
 
 def draw(clean, *effects, cfa="mono", shutter="rolling", **keywords):
@@ -52,6 +54,8 @@ def point(shape=(3, 5, 5), at=(1, 2, 2)):
         (Crosstalk(0.05), "RGGB", {(1, 2, 2): 80, (1, 1, 2): 5, (1, 3, 2): 5, (1, 2, 1): 5, (1, 2, 3): 5}),
         (ReadoutBandwidth(0.2), "mono", {(1, 2, 2): 80, (1, 2, 3): 20}),
         (ReadoutBandwidth(0.2), "RGGB", {(1, 2, 2): 80, (1, 2, 3): 20}),
+        (ReadoutOvershoot(0.2), "mono", {(1, 2, 2): 120, (1, 2, 3): -20}),
+        (ReadoutOvershoot(0.2), "RGGB", {(1, 2, 2): 120, (1, 2, 3): -20}),
         (ImageLag(0.2), "mono", {(1, 2, 2): 80, (2, 2, 2): 20}),
     ],
 )
@@ -76,20 +80,26 @@ def test_crosstalk_loses_no_electrons():
 def test_first_frame_and_first_column_have_no_past():
     clean = np.random.default_rng(0).uniform(0, 50, (3, 5, 5))
     np.testing.assert_allclose(draw(clean, ImageLag(0.2))[0], clean[0], rtol=1e-12)
-    np.testing.assert_allclose(draw(clean, ReadoutBandwidth(0.2))[:, :, 0], clean[:, :, 0], rtol=1e-12)
+    for along_row in (ReadoutBandwidth(0.2), ReadoutOvershoot(0.2)):
+        np.testing.assert_allclose(draw(clean, along_row)[:, :, 0], clean[:, :, 0], rtol=1e-12)
 
 
-# Shot noise is shared by all three; read noise by the readout chain only.
+# Shot noise is shared by all; read noise by the readout chain only.
 @pytest.mark.parametrize("effect", COUPLINGS, ids=lambda effect: effect.name)
 def test_couplings_act_on_the_right_noise(effect):
-    kept = {"crosstalk": 0.8**2 + 4 * 0.05**2, "readout_bandwidth": 0.8**2 + 0.2**2, "image_lag": 0.8**2 + 0.2**2}
-    lag = {"crosstalk": 2 * 0.8 * 0.05, "readout_bandwidth": 0.8 * 0.2, "image_lag": 0.8 * 0.2}[effect.name]
+    # Variance that is kept, and covariance with the next pixel or frame.
+    kept, lag = {
+        "crosstalk": (0.8**2 + 4 * 0.05**2, 2 * 0.8 * 0.05),
+        "readout_bandwidth": (0.8**2 + 0.2**2, 0.8 * 0.2),
+        "readout_overshoot": (1.2**2 + 0.2**2, -1.2 * 0.2),
+        "image_lag": (0.8**2 + 0.2**2, 0.8 * 0.2),
+    }[effect.name]
     shape = (40, 60, 60)
     shot = draw(np.full(shape, 9.0), ShotNoise(), effect)[1:, :, 1:] - 9.0
     read = draw(np.zeros(shape), ReadNoise(3.0), effect)[1:, :, 1:]
     inner = shot[:, 1:-1, :-1]
-    assert abs(np.mean(inner**2) / 9 - kept[effect.name]) < 5 * np.std(inner**2) / 9 / np.sqrt(inner.size / 4)
-    factor = kept[effect.name] if effect.name == "readout_bandwidth" else 1
+    assert abs(np.mean(inner**2) / 9 - kept) < 5 * np.std(inner**2) / 9 / np.sqrt(inner.size / 4)
+    factor = kept if effect.stage == Stage.READOUT else 1
     assert abs(np.mean(read**2) / 9 - factor) < 5 * np.std(read**2) / 9 / np.sqrt(read.size / 4)
     pair = shot[1:] * shot[:-1] if effect.name == "image_lag" else shot[:, 1:-1, 1:] * shot[:, 1:-1, :-1]
     assert abs(pair.mean() / 9 - lag) < 5 * pair.std() / 9 / np.sqrt(pair.size / 4)

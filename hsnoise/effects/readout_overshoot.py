@@ -1,0 +1,32 @@
+"""A pixel is read too far from the previous one along the readout."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class ReadoutOvershoot(AbstractEffect):
+    """Pixel j of a row reads itself and `fraction` of its difference from pixel j - 1, read just before it.
+
+    The output amplifier swings beyond its new level, or the clamp of correlated double sampling still holds some of the
+    previous pixel. It acts on the read noise, too; in a Bayer sensor the previous pixel has another colour. The first
+    pixel of a row follows a level like its own, so means stay as they are. The opposite of `ReadoutBandwidth`.
+
+    In dark frames: noise of neighbours along the row is anticorrelated and its variance (1 + f)^2 + f^2 of what it was,
+    at all exposures; behind a bright pixel lies a dark one.
+
+    Reference: Janesick, *Scientific Charge-Coupled Devices*, SPIE 2001 (settling of the video signal).
+    """
+
+    name: ClassVar[str] = "readout_overshoot"
+    stage: ClassVar[Stage] = Stage.READOUT
+    fraction: Scalar = param("1", low=0, high=1, doc="part of the step from the previous pixel that is added")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        previous = jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)
+        return signal + self.fraction * (signal - previous)
