@@ -128,7 +128,7 @@ def improved(folder: Path, only: list[str]) -> None:
     stacks["TC-237"] = [captures(folder, "sbig_st7e_tc237_ccd_clipped")[0]["bias"]], [0.0], 65535
     data, about = captures(folder, "sbig_stl1001_ccd")
     names = ["bias_m05C", "dark_m05C_060s"]
-    stacks["STL-1001"] = [data[n] for n in names], [about[n]["exposure_s"] for n in names], 65535
+    stacks["STL-1001"] = [data[n][:, :ROWS] for n in names], [about[n]["exposure_s"] for n in names], 65535
     for sensor, (counts, exposure_s, white_level) in stacks.items():
         if only and sensor not in only:
             continue

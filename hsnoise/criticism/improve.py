@@ -248,11 +248,12 @@ def _is_better(step: Step, before: Step) -> bool:
     """Whether statistics, and frames that no fit has seen, fit better or as well with what was added."""
     # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
     seen = np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params)
-    after, until_now = step.comparison, before.comparison
-    less = sum(after.groups.values()) < sum(until_now.groups.values())
+    gained, after, until_now = step.held_out - before.held_out, step.comparison, before.comparison
+    if after.error <= until_now.error:
+        return seen or gained > WORSE
     # The worst group may be that of another effect, which is still missing and does not stand quite still.
-    fits = after.error <= until_now.error * (CHANGE_OF_OTHERS if less else 1.0)
-    return fits and (seen or step.held_out - before.held_out > WORSE)
+    less = sum(after.groups.values()) < sum(until_now.groups.values())
+    return less and after.error <= CHANGE_OF_OTHERS * until_now.error and (seen or gained > 0)
 
 
 def _is_there(effect: AbstractEffect, result: FitResult) -> bool:

@@ -282,6 +282,7 @@ def test_bad_input_is_refused(call, error, message):
     ("groups", "held_out", "better"),
     [
         ({"frames": 36.0, "columns": 1.0}, 50.0, True),  # the worst group waits for another effect
+        ({"frames": 36.0, "columns": 1.0}, -1.0, False),  # by chance: frames that no fit has seen do not fit better
         ({"frames": 36.0, "columns": 21.0}, 50.0, False),  # nothing gained
         ({"frames": 60.0, "columns": 1.0}, 50.0, False),  # much worse elsewhere
         ({"frames": 30.0, "columns": 20.0}, -50.0, False),  # frames that no fit has seen fit worse
