@@ -38,7 +38,7 @@ MOST_PAIRS = 3  # that are refined, two effects at once
 NEAR = 0.8  # share of the best score that makes a candidate a leader
 MANY_DETAILS = 16  # of which the leaders' best are taken
 AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 10  # amplitudes, relative, at which the leaders are drawn again
-EVIDENCE = 5.0  # log-likelihood ratio from which an effect is there: 3 of 14 clean captures reached 2.3 to 2.6
+EVIDENCE = 8.0  # log-likelihood ratio from which an effect is there: by chance in 1 of 100 captures, of 26 candidates
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
 MISFIT_LEFT, SHARE_LEFT, MOST_LEFT = 3.5, 0.05, 10.0

@@ -26,7 +26,7 @@ from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
 CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
-MOST_STEPS = 6
+MOST_STEPS = 8
 MOST_TRIED = 2  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 LIKELIHOOD_DRAWS = 40
