@@ -18,6 +18,7 @@ import numpy as np
 from hsnoise._threads import in_threads
 from hsnoise.coordinates import Coordinates, coordinates_for
 from hsnoise.draws import black_level_of, draw_capture, floored_variance, part_of
+from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, physics_of
@@ -38,74 +39,10 @@ STEP_SIGMA, STEP_LOG = 2.0, 0.2  # for derivatives: standard errors, and for eff
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
-OFF_BOUNDS = 0.02  # share of the range between two bounds
-SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
 SHRINKAGE, DRAWS_OF_ALL = 0.1, 10.0  # what all numbers say of the scatter of one counts as so many draws
 MARGIN = 1.15
 UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
-
-
-@dataclass(frozen=True)
-class Knob:
-    """One number of an added effect: name in tables, its place, bounds, and for one without bounds its size."""
-
-    label: str
-    effect: str
-    field: str
-    index: tuple[int, ...]
-    low: float | None
-    high: float | None
-    size: float = 1.0
-
-    def forward(self, value: float) -> float:
-        """The unconstrained number: a logarithm above a lower bound, a logit between two, else the value in sizes."""
-        if self.low is None:
-            return value / self.size
-        if self.high is None:
-            return float(np.log(max(value - self.low, 1e-9)))
-        share = (value - self.low) / (self.high - self.low)
-        share = OFF_BOUNDS if share < 1e-6 else min(share, 1 - OFF_BOUNDS)  # at a bound itself nothing could move it
-        return float(np.log(share / (1 - share)))
-
-    def inverse(self, x: float) -> float:
-        if self.low is None:
-            return float(x * self.size)
-        grown = np.exp(np.clip(x, -25, 25))
-        return float(self.low + (grown if self.high is None else (self.high - self.low) * grown / (1 + grown)))
-
-    def read(self, model: NoiseModel) -> float:
-        """The unconstrained number in `model`."""
-        return self.forward(float(np.asarray(getattr(model[self.effect], self.field))[self.index]))
-
-    def put(self, model: NoiseModel, x: float) -> NoiseModel:
-        """`model` with this number."""
-        moved = np.array(getattr(model[self.effect], self.field), float)
-        moved[self.index] = self.inverse(x)
-        return model.with_value(self.effect, self.field, moved)
-
-    def slope(self, x: float) -> float:
-        """d value / d x."""
-        if self.low is None:
-            return self.size
-        grown = float(np.exp(np.clip(x, -25, 25)))
-        return grown if self.high is None else (self.high - self.low) * grown / (1 + grown) ** 2
-
-
-def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
-    """The numbers of the effects called `extra`, less those that are held."""
-    found = []
-    for name in extra:
-        effect = model[name]
-        labels = iter(p.name for p in effect.parameters(model.channels))
-        for field, spec in effect.specs().items():
-            for place in [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]:
-                label = next(labels)
-                value = float(np.asarray(getattr(effect, field))[place])
-                size = abs(value) if 0 < abs(value) < SMALL else 1.0
-                if not spec.holds(value):
-                    found.append(Knob(label, name, field, place, spec.low, spec.high, size))
-    return found
 
 
 @dataclass(frozen=True)
@@ -271,6 +208,14 @@ class _Point:
     drawn: np.ndarray
     off: np.ndarray
 
+    def weight(self, equal: np.ndarray) -> np.ndarray:
+        """Weights [statistic, statistic], those of statistics that are far off made smaller."""
+        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(self.off), 1e-12)))
+        return share[:, None] * equal * share
+
+    def cost(self, weight: np.ndarray, problem: Problem) -> float:
+        return float(self.off @ weight @ self.off + problem.prior @ (self.y - problem.start) ** 2)
+
 
 def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
@@ -280,46 +225,39 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     """
     measured, _ = problem.statistics(problem.part)
     scale, equal, scattered = _weights(problem, problem.start, tick)
-    prior = problem.prior
 
     def point(y: np.ndarray) -> _Point:
         drawn = _draws(problem, y, tick)
         return _Point(y, drawn, (measured - drawn.mean(0)) / scale)
 
-    def cost(of: _Point) -> float:
-        return float(of.off @ weight @ of.off + prior @ (of.y - problem.start) ** 2)
-
-    here, damping, taken, wanted, fresh, iterations = point(problem.start), 0.0, 0, True, False, 0
-    if problem.other_start is not None:
-        other = point(problem.other_start)
-        here = min(here, other, key=lambda of: np.minimum(np.abs(of.off), FAR_OFF) @ np.abs(of.off))
+    here, damping, taken, wanted, fresh, iterations = _first(problem, point), 0.0, 0, True, False, 0
     by = np.where(np.arange(len(here.y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
     while iterations < MOST_ITERATIONS:
         iterations += 1
-        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(here.off), 1e-12)))
-        weight = share[:, None] * equal * share
+        weight = here.weight(equal)
         if wanted:
             slopes = _slopes(problem, here.y, by, here.drawn, tick) / scale[:, None]
             taken, fresh, of = taken + 1, True, here.y
         gain = slopes.T @ weight
-        information = gain @ slopes + np.diag(prior)
+        information = gain @ slopes + np.diag(problem.prior)
         covariance = np.linalg.inv(information)
-        by = np.minimum(by, STEP_SIGMA * np.sqrt(np.diagonal(covariance)))
-        uphill = gain @ here.off - prior * (here.y - problem.start)
-        length = float(np.abs(covariance @ uphill / np.sqrt(np.diagonal(covariance))).max())
+        deviation = np.sqrt(np.diagonal(covariance))
+        by = np.minimum(by, STEP_SIGMA * deviation)
+        uphill = gain @ here.off - problem.prior * (here.y - problem.start)
+        length = float(np.abs(covariance @ uphill / deviation).max())
         if not np.isfinite(length):
             raise RuntimeError(_not_finite(problem, here.y))
         step = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), uphill)
         ahead = here.y + step * problem.share_of(step)
-        gone = float(np.abs((here.y - of) / np.sqrt(np.diagonal(covariance))).max())
-        if length < SHORT_STEP and gone > SURE_STEP and taken < 2 * MOST_SLOPES:
-            wanted = True  # derivatives of another place would end the search where they are not those of here
-            continue
         if length < SHORT_STEP:
+            # Derivatives of another place would end the search where those of here do not.
+            wanted = np.abs((here.y - of) / deviation).max() > SURE_STEP and taken < 2 * MOST_SLOPES
+            if wanted:
+                continue
             here = replace(here, y=ahead)
             break
         there = point(ahead)
-        before, after = cost(here), cost(there)
+        before, after = here.cost(weight, problem), there.cost(weight, problem)
         if after < (1 + SLACK) * before + 1:
             most = MOST_SLOPES if after < MUCH_LESS * before else 2 * MOST_SLOPES
             wanted = length >= SURE_STEP and taken < most
@@ -327,8 +265,13 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
     sets = [(drawn - drawn.mean(0)) / scale for drawn in (here.drawn, scattered)]
-    covariance = _as_scattered(covariance, gain, sets)
-    return here.y, covariance, length, iterations
+    return here.y, _as_scattered(covariance, gain, sets), length, iterations
+
+
+def _first(problem: Problem, point) -> _Point:
+    """Where the search starts: at the base fit, or with the base parameters that were given, whichever is nearer."""
+    starts = [problem.start] if problem.other_start is None else [problem.start, problem.other_start]
+    return min(map(point, starts), key=lambda of: np.minimum(np.abs(of.off), FAR_OFF) @ np.abs(of.off))
 
 
 def _not_finite(problem: Problem, y: np.ndarray) -> str:

@@ -13,8 +13,8 @@ from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench, law_of
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
+from hsnoise.knobs import Knob, knobs
 from hsnoise.model import NoiseModel
-from hsnoise.synthetic import Knob, knobs
 
 ITERATIONS = 3
 DRAWS, SLOPE_DRAWS, PAIR_DRAWS = 6, 3, 12
