@@ -1,0 +1,47 @@
+"""The loop on bias frames of a CCD that hide three effects at once, by a simulator in NumPy of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise.synthetic import Problem
+
+FRAMES, SHAPE, GAIN, BLACK_DN = 8, (200, 256), 1.8, 150
+
+
+def bias_frames(seed: int) -> hsnoise.FrameStack:
+    """1 % hot pixels of 150 e-, a black level that falls by 40 DN over the columns, frames that differ by 4 DN."""
+    rng = np.random.default_rng(seed)
+    hot = (rng.random(SHAPE) < 0.01) * rng.exponential(150.0, SHAPE)
+    electrons = rng.poisson(hot, (FRAMES, *SHAPE)) + 12 * rng.standard_normal((FRAMES, *SHAPE))
+    falling = -40 * np.arange(SHAPE[1]) / (SHAPE[1] - 1)
+    counts = GAIN * electrons + falling + 4 * rng.standard_normal((FRAMES, 1, 1)) + BLACK_DN
+    return hsnoise.FrameStack([np.clip(np.rint(counts), 0, 65535).astype(np.uint16)], [0.0], shutter="global")
+
+
+def test_what_bias_frames_know_keeps_its_digits_beside_what_they_do_not():
+    """The read noise in DN is known to a part in a thousand, row gain and electrons not at all."""
+    stack = bias_frames(0)
+    base = hsnoise.fit(stack)
+    problem = Problem(stack, base, base.params, (), [], 0, base.params)
+    deviations = np.sqrt(problem.spread[0])
+    assert np.all(np.isfinite(deviations)) and 3e-4 < deviations.min() < 1e-2
+
+
+@pytest.mark.slow
+def test_three_effects_at_once_are_found_in_bias_frames():
+    story = hsnoise.improve(bias_frames(0))
+    assert {step.added for step in story.steps[1:]} == {"hot_pixels", "black_shading", "frame_offset"}
+    assert story.finished and story.errors[0] > 1000 and story.errors[-1] < 2
+    table, shading = story.fit.table, story.params["black_shading"]
+    assert (shading.axis, shading.start == "first") == ("column", shading.above)  # falls from the first column
+    gain = table["gain"][0]
+    for value, error, truth in (
+        (table["hot_pixels.fraction"][0], table["hot_pixels.fraction"][1], 0.01),
+        (table["hot_pixels.at_readout"][0] * gain, table["hot_pixels.at_readout"][1] * gain, 150 * GAIN),
+        (table["black_shading.amplitude"][0], table["black_shading.amplitude"][1], 40 / np.sqrt(12)),
+    ):
+        assert abs(value - truth) < 4 * error
+    assert table["read_noise.sigma"][0] * gain == pytest.approx(12 * GAIN, rel=0.02)
