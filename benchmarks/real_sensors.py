@@ -120,12 +120,13 @@ def stl1001(folder: Path) -> None:
 
 
 def improved(folder: Path, only: list[str]) -> None:
-    """The story of `hsnoise.improve` on the darks of each sensor, or of `only` these."""
+    """The story of `hsnoise.improve` on the darks of each sensor, or of `only` these; on a part of a CCD's frames."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
     names = [name for name in data.files if name.startswith("dark")]
     stacks["IMX541"] = [data[n] for n in names], [about[n]["exposure_s"] for n in names], 4095
-    stacks["TC-237"] = [captures(folder, "sbig_st7e_tc237_ccd_clipped")[0]["bias"]], [0.0], 65535
+    bias = captures(folder, "sbig_st7e_tc237_ccd_clipped")[0]["bias"]
+    stacks["TC-237"] = [bias[:, 100:300, 200:456]], [0.0], 65535
     data, about = captures(folder, "sbig_stl1001_ccd")
     names = ["bias_m05C", "dark_m05C_060s"]
     stacks["STL-1001"] = [data[n][:, :ROWS] for n in names], [about[n]["exposure_s"] for n in names], 65535

@@ -20,6 +20,7 @@ MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
+FAR_OFF = 5.0  # deviations from which a statistic counts less
 FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
 
 
@@ -137,6 +138,11 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
         coefficients = np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T
         surface[r::step, c::step] = down @ coefficients @ across.T
     return surface
+
+
+def share_of_far(z: np.ndarray) -> np.ndarray:
+    """Square roots of Huber's weights of deviations z: what is far off counts less."""
+    return np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(z), 1e-12)))
 
 
 def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:

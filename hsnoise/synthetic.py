@@ -17,7 +17,7 @@ import numpy as np
 
 from hsnoise._threads import in_threads
 from hsnoise.coordinates import Coordinates, coordinates_for
-from hsnoise.draws import black_level_of, draw_capture, floored_variance, part_of
+from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_variance, part_of, share_of_far
 from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
@@ -31,7 +31,6 @@ from hsnoise.structure import structure
 COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
 MOST_SLOPES, MOST_ITERATIONS = 4, 20  # derivatives cost four times what means do, and change little near the end
 SLACK, MUCH_LESS = 0.02, 0.8  # of the cost: rare counts make it rough; a step for which old derivatives are good enough
-FAR_OFF = 5.0  # deviations from which a statistic counts less
 LEAST_DAMPING = 0.1  # of the information, once a step failed
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
@@ -94,7 +93,7 @@ class Problem:
         values, vectors = self.spread
         return self.sizes[:, None] * vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
 
-    @property
+    @cached_property
     def prior(self) -> np.ndarray:
         """Inverse variances that keep numbers near the start: of effects, and where the base fit knew nothing."""
         base = np.where(self.spread[0] < MOST_SPREAD, 1e-6, 1.0)
@@ -118,11 +117,11 @@ class Problem:
     def rules(self):
         return plan_rules(self.centre_physics, summarise(self.part, coding=self.coding), MARGIN)
 
-    @property
+    @cached_property
     def start(self) -> np.ndarray:
         return np.concatenate([np.zeros(len(self.centre)), [knob.read(self.model) for knob in self.knobs]])
 
-    @property
+    @cached_property
     def other_start(self) -> np.ndarray | None:
         """Where the base parameters are those of `model`, which may know more of the effects than `base` did."""
         own = NoiseModel(
@@ -210,7 +209,7 @@ class _Point:
 
     def weight(self, equal: np.ndarray) -> np.ndarray:
         """Weights [statistic, statistic], those of statistics that are far off made smaller."""
-        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(self.off), 1e-12)))
+        share = share_of_far(self.off)
         return share[:, None] * equal * share
 
     def cost(self, weight: np.ndarray, problem: Problem) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.criticism.fingerprint import Bench
-from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
@@ -39,8 +39,7 @@ def clamp_by_likelihood(
     if not score > 0 or not np.any(np.asarray(clamped.params[CLAMP].rate)):
         return None
     own = reference(clamped.params, bench.part, DRAWS, bench.seed, bench.tick)
-    law = shrunk(own.own_z(), np.zeros((1, len(own.mean))))
     z = own.z(measure(bench.part, clamped.params).values)
-    misfit = max(law.normal_scores(z, own.groups).values())
+    misfit = max(own.law.normal_scores(z, own.groups).values())
     candidate = Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)
-    return candidate, replace(evidence, z=z), law
+    return candidate, replace(evidence, z=z), own.law

@@ -197,8 +197,7 @@ def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:
     and read noise, so far off that draws from there tell of it badly, or not at all: "nothing missing".
     """
     if found.verdict == "nothing missing":
-        as_fitted = shrunk(bench.base.own_z(), np.zeros((1, len(evidence.z))))
-        return evidence.misfit(as_fitted) > MISFIT
+        return evidence.misfit(bench.base.law) > MISFIT
     leaders = [c.name for c in found.ranking[:2] if c.score > EVIDENCE]
     return found.verdict == "unexplained" or not LIKE_A_CLAMP.isdisjoint(leaders)
 

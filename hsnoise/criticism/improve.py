@@ -14,7 +14,6 @@ from rich.table import Table
 from hsnoise._arguments import callback, counter, seed_of
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
-from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_effects, check_fits, darks_of
@@ -347,8 +346,7 @@ def _log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
     """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
     own = reference(model, frames, LIKELIHOOD_DRAWS, seed + 5000)
     values = measure(frames, model).values
-    law = shrunk(own.own_z(), np.zeros((1, len(values))))
-    return float(law.log_density(own.z(values)) - np.log(own.deviation).sum())
+    return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
 
 
 def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:

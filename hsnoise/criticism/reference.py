@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hsnoise._threads import in_threads
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.draws import black_level_of, draw_capture, floored_variance
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
@@ -35,6 +37,11 @@ class Reference:
     def z(self, values: np.ndarray) -> np.ndarray:
         """(values - mean) / deviation, the error of the mean included."""
         return (values - self.mean) / (self.deviation * np.sqrt(1 + 1 / len(self.draws)))
+
+    @cached_property
+    def law(self) -> Gaussian:
+        """Law of z of the model's own draws, all parameters held."""
+        return shrunk(self.own_z(), np.zeros((1, len(self.mean))))
 
     def own_z(self) -> np.ndarray:
         """z of each draw against all others [draw, statistic]."""

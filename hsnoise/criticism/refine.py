@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 
 import numpy as np
 
 from hsnoise._threads import in_threads
-from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Bench, law_of
-from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, law_of
+from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Evidence, Pair
+from hsnoise.draws import share_of_far
 from hsnoise.effects import AbstractEffect
 from hsnoise.knobs import Knob, knobs
 from hsnoise.model import NoiseModel
@@ -22,25 +23,24 @@ STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
 MANY_DRAWS = 24
 NEARBY_ERROR = 0.02  # of shifts close to the capture
-FAR_OFF = 5.0  # deviations from which a statistic counts less
 TINY = 1e-3  # a parameter of the base that is zero
+
+Step = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def refined(effects: Sequence[AbstractEffect], bench: Bench, evidence: Evidence) -> tuple[AbstractEffect, ...]:
     """The effects, in the sensor together, with the parameters at which draws come closest to the capture."""
     names = tuple(effect.name for effect in effects)
     model = reduce(NoiseModel.add, effects, bench.model)
-    turned = knobs(model, names)
-    y = np.array([knob.read(model) for knob in turned])
-    for _ in range(ITERATIONS):
-        shifts, slopes = _shifts_and_slopes(model, turned, y, bench)
+
+    def step(shifts: np.ndarray, slopes: np.ndarray, gone: np.ndarray) -> np.ndarray:
         mean = shifts.mean(0)
         covariance = evidence.null.covariance + np.diag((RELATIVE_ERROR * mean) ** 2 + shifts.var(0, ddof=1))
         weighted = np.linalg.solve(covariance, slopes).T
-        information = weighted @ slopes + np.eye(len(y)) / PRIOR_SIGMA**2
-        step = np.linalg.solve(information, weighted @ (evidence.z - mean))
-        y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    model = _at(model, turned, y)
+        information = weighted @ slopes + np.eye(len(gone)) / PRIOR_SIGMA**2
+        return np.linalg.solve(information, weighted @ (evidence.z - mean))
+
+    model = _stepped(model, knobs(model, names), step, bench)
     return tuple(model[name] for name in names)
 
 
@@ -61,24 +61,30 @@ def score_with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) ->
     Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
     no evidence that there is the effect at all: nothing of the base is held against it.
     """
-    own = shrunk(bench.base.own_z(), np.zeros((1, len(evidence.z)))).covariance
+    own = bench.base.law.covariance
     model = bench.model.add(effect)
     numbers = knobs(model, (effect.name,)), _base_knobs(model)
-    turned = [*numbers[0], *numbers[1]]
     prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in numbers]) ** -2
-    start = y = np.array([knob.read(model) for knob in turned])
-    for _ in range(ITERATIONS):
-        shifts, slopes = _shifts_and_slopes(model, turned, y, bench)
+
+    def step(shifts: np.ndarray, slopes: np.ndarray, gone: np.ndarray) -> np.ndarray:
         law = _law_nearby(shifts, own)
         off = evidence.z - law.mean
-        far = np.abs(off) / np.sqrt(np.diagonal(law.covariance))
-        share = np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(far, 1e-12)))
+        share = share_of_far(off / np.sqrt(np.diagonal(law.covariance)))
         weighted = slopes.T @ (share[:, None] * np.linalg.inv(law.covariance) * share)
-        step = np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * (y - start))
-        y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    there = _at(model, turned, y)
+        return np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * gone)
+
+    there = _stepped(model, [*numbers[0], *numbers[1]], step, bench)
     shifts = np.stack(in_threads(lambda number: bench.shift(there, number), range(MANY_DRAWS), bench.tick))
     return evidence.score(_law_nearby(shifts, own))
+
+
+def _stepped(model: NoiseModel, turned: list[Knob], step_of: Step, bench: Bench) -> NoiseModel:
+    """The model after a few steps of its numbers, made from shifts, slopes and how far the numbers have gone."""
+    start = y = np.array([knob.read(model) for knob in turned])
+    for _ in range(ITERATIONS):
+        step = step_of(*_shifts_and_slopes(model, turned, y, bench), y - start)
+        y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
+    return _at(model, turned, y)
 
 
 def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
@@ -90,10 +96,11 @@ def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
 def _base_knobs(model: NoiseModel) -> list[Knob]:
     """The base parameters that are not zero; black levels are told by the means of the counts alone."""
     found = []
-    for name, field in (("gain", "value"), ("dark_current", "rate"), ("read_noise", "sigma"), ("row_gain", "sigma")):
-        values = np.asarray(getattr(model[name], field), float) if name in model else np.zeros(0)
-        places = [place for place in np.ndindex(values.shape) if values[place] > TINY]
-        found += [Knob(name, name, field, place, 0.0, None) for place in places]
+    for name, field in BASE.items():
+        if name in model and name != "black_level":
+            values = np.asarray(getattr(model[name], field), float)
+            places = [place for place in np.ndindex(values.shape) if values[place] > TINY]
+            found += [Knob(name, name, field, place, 0.0, None) for place in places]
     return found
 
 

@@ -322,6 +322,11 @@ def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
     return normal_of_bits(pixel_words(key, like.shape)[1]).astype(like.dtype)
 
 
+def step_from_previous(signal: Frames) -> Frames:
+    """Each pixel less the one read before it in its row, of whatever colour; 0 for the first of a row."""
+    return signal - jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)
+
+
 GAIN_DC_UNTIL = 0.3  # row gain that is nearly white has a mean, that of the paper's 1/f has none
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param, step_from_previous
 
 
 class ReadoutOvershoot(AbstractEffect):
@@ -28,5 +26,4 @@ class ReadoutOvershoot(AbstractEffect):
     fraction: Scalar = param("1", low=0, high=1, doc="part of the step from the previous pixel that is added")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        previous = jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)
-        return signal + self.fraction * (signal - previous)
+        return signal + self.fraction * step_from_previous(signal)

@@ -75,8 +75,8 @@ def _shading(profiles: dict[str, np.ndarray]) -> tuple[str, str, bool, float]:
 
 def _decay(n: int, start: str, length: float) -> np.ndarray:
     """exp(-distance / length) of n lines, of mean 0 and unit norm."""
-    fallen = -np.expm1(-np.linspace(0, 1, n) / length)
-    shape = fallen.mean() - fallen
+    shape = np.exp(-np.linspace(0, 1, n) / length)
+    shape = shape - shape.mean()
     shape = shape / np.sqrt((shape**2).sum())
     return shape if start == "first" else shape[::-1]
 
