@@ -81,7 +81,7 @@ def score_with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) ->
 def _stepped(model: NoiseModel, turned: list[Knob], step_of: Step, bench: Bench) -> NoiseModel:
     """The model after a few steps of its numbers, made from shifts, slopes and how far the numbers have gone."""
     start = y = np.array([knob.read(model) for knob in turned])
-    for _ in range(ITERATIONS):
+    for _ in range(ITERATIONS if turned else 0):  # an effect may hold all its numbers
         step = step_of(*_shifts_and_slopes(model, turned, y, bench), y - start)
         y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
     return _at(model, turned, y)

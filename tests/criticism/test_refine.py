@@ -59,3 +59,12 @@ def test_settings_and_bounds_are_kept(like):
     (found,) = refined([fx.TapOffsets(1.0, taps=4)], bench, evidence)
     assert found.taps == 4
     assert 0 <= float(found.sigma) < 0.8  # no offsets in this capture
+
+
+def test_an_effect_that_holds_all_its_numbers_stays_as_it_is(like):
+    darks = draw_capture(8, CAMERA, like)
+    bench = Bench(CAMERA, darks, reference(CAMERA, darks, 24, 100), 100, nothing)
+    null = shrunk(bench.base.own_z(), bench.slopes())
+    evidence = Evidence(np.zeros(len(bench.base.names)), null, bench.base.names, bench.base.groups, 1)
+    (found,) = refined([fx.MissingCodes(1.6)], bench, evidence)
+    assert float(found.gain) == pytest.approx(1.6)
