@@ -44,6 +44,7 @@ MODEST = {
     "dark_signal_nonuniformity": 1.5,
     "hot_pixels": 0.004,  # of the pixels
     "amplifier_glow": 60.0,  # e-/s in the corner
+    "dark_current_nonuniformity": 0.15,  # relative, rms over pixels
     "dark_current_drift": 0.25,  # relative, from the first frame of an exposure to the last
     "random_telegraph_noise": 0.03,  # of the pixels, 12 e-
     "heavy_tailed_read_noise": 5.0,  # degrees of freedom
@@ -159,6 +160,8 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
     elif effect == "hot_pixels":
         hot = rng.random(shape) < size
         out["rate"] = hot * rng.exponential(rng.uniform(200, 800), shape)
+    elif effect == "dark_current_nonuniformity":
+        out["rate"] = camera.dark * (rng.gamma(1 / size**2, size**2, shape) - 1)
     elif effect == "amplifier_glow":
         far = np.hypot((r - rng.choice([0, rows - 1])) / rows, (c - rng.choice([0, columns - 1])) / columns)
         out["rate"] = size * np.exp(-far / rng.uniform(0.2, 0.5))

@@ -46,7 +46,8 @@ class Arrivals(AbstractEffect):
 
     def expose(self, light: jax.Array, shape: tuple[int, ...], capture: Capture, *, key: RandomKey) -> Frames:
         """Electrons [frame, row, column] from the expected photoelectrons of each pixel, or one number for all."""
-        mean = light + self.rate * capture.exposure_s
+        dark = self.rate * capture.exposure_s
+        mean = light + (dark if capture.dark_current_scale is None else dark * capture.dark_current_scale)
         first, second = pixel_words(key, shape)
         if self.sigma is None:
             return poisson_of_bits(first, jax.lax.stop_gradient(mean), self.regime).astype(mean.dtype)

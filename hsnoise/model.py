@@ -27,7 +27,7 @@ from hsnoise._poisson import Regime, regime_of
 from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced
 from hsnoise.arrivals import merged
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
-from hsnoise.signal_chain import apply_by_effect, apply_fenced, apply_in_one, signals
+from hsnoise.signal_chain import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 
 FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 
@@ -324,7 +324,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
     """What is known of the mean electrons where light, between `low` and `high`, has not been changed before."""
     rate = params["dark_current"].rate if "dark_current" in params else 0.0
-    changed = any(effect.acts_at < Stage.PHOTONS for effect in params)
+    changed = any(effect.acts_at < Stage.PHOTONS or may_scale("dark_current_scale", effect) for effect in params)
     if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
         return "any"
     dark = float(rate) * float(exposure_s)

@@ -13,6 +13,8 @@ from hsnoise._keys import named_key
 from hsnoise.arrivals import Arrivals
 from hsnoise.effects import AbstractEffect, Stage
 
+SCALES = ("read_noise_scale", "dark_current_scale")  # how an effect shapes what another one draws
+
 
 def apply_by_effect(key, light, shape, effects, capture):
     """What leaves the last effect, [frame, row, column]; each is compiled by itself."""
@@ -24,10 +26,8 @@ def signals(key, light, shape, effects, capture):
 
     Raises ValueError, naming the effect, for one that returns no signal of this shape.
     """
-    scales = [_read_noise_scale(key, effect, capture, shape) for effect in effects if _may_scale(effect)]
-    scales = [scale for scale in scales if scale is not None]
-    if scales:
-        capture = dataclasses.replace(capture, read_noise_scale=reduce(jnp.multiply, scales))
+    scales = {what: _scale_of(what, key, effects, capture, shape) for what in SCALES}
+    capture = dataclasses.replace(capture, **scales)
     signal = light
     for effect in effects:
         try:
@@ -66,13 +66,21 @@ def apply_fenced(key, light, shape, effects, capture):
     return jax.lax.platform_dependent(key, light, effects, capture, cpu=fenced, default=draw)
 
 
-def _may_scale(effect: AbstractEffect) -> bool:
-    return type(effect).read_noise_scale is not AbstractEffect.read_noise_scale
+def may_scale(what: str, effect: AbstractEffect) -> bool:
+    """Whether an effect shapes what another one draws; `what` of SCALES."""
+    return getattr(type(effect), what) is not getattr(AbstractEffect, what)
 
 
-@partial(jax.jit, static_argnums=3)
-def _read_noise_scale(key, effect, capture, shape):
-    return effect.read_noise_scale(capture, shape, key=named_key(key, effect.name))
+def _scale_of(what, key, effects, capture, shape):
+    """Product of the factors of all effects on the read noise or dark current of each pixel; None: 1."""
+    factors = [_factor(what, key, effect, capture, shape) for effect in effects if may_scale(what, effect)]
+    factors = [factor for factor in factors if factor is not None]
+    return reduce(jnp.multiply, factors) if factors else None
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _factor(what, key, effect, capture, shape):
+    return getattr(effect, what)(capture, shape, key=named_key(key, effect.name))
 
 
 @partial(jax.jit, static_argnums=2)

@@ -173,6 +173,8 @@ def _dark_signal(s: Scale) -> dict[str, Maker]:
     }
     if s.exposures_differ and s.rate * s.longest_s > LEAST_ELECTRONS:
         level = s.gain * s.rate
+        grain = 0.35 * s.read_noise / (s.rate * s.longest_s)
+        makers["dark_current_nonuniformity"] = lambda f, rng: fx.DarkCurrentNonuniformity(min(grain * f, 1.5))
         makers["black_clamp"] = lambda f, rng: fx.BlackClamp(level * min(0.7 * f, 1.0))
     return makers
 

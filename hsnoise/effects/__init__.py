@@ -14,6 +14,7 @@ from hsnoise.effects.cosmic_rays import CosmicRays
 from hsnoise.effects.crosstalk import Crosstalk
 from hsnoise.effects.dark_current import DarkCurrent
 from hsnoise.effects.dark_current_drift import DarkCurrentDrift
+from hsnoise.effects.dark_current_nonuniformity import DarkCurrentNonuniformity
 from hsnoise.effects.dark_signal_nonuniformity import DarkSignalNonuniformity
 from hsnoise.effects.frame_offset import FrameOffset
 from hsnoise.effects.gain import Gain
@@ -56,6 +57,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     HotPixels,
     AmplifierGlow,
     DarkCurrentDrift,
+    DarkCurrentNonuniformity,
     RandomTelegraphNoise,
     HeavyTailedReadNoise,
     ReadNoiseNonuniformity,
@@ -87,6 +89,7 @@ __all__ = [
     "Crosstalk",
     "DarkCurrent",
     "DarkCurrentDrift",
+    "DarkCurrentNonuniformity",
     "DarkSignalNonuniformity",
     "EFFECTS",
     "FrameOffset",

@@ -135,6 +135,7 @@ class Capture(eqx.Module):
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
         gain: system gain [channel], DN/e-; None if the model has none.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
+        dark_current_scale: factor on the dark current of each pixel, as above.
         differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
     """
@@ -145,6 +146,7 @@ class Capture(eqx.Module):
     shutter: str = eqx.field(static=True)
     sensor_key: RandomKey
     read_noise_scale: Frames | PixelMap | None = None
+    dark_current_scale: Frames | PixelMap | None = None
     gain: PerChannel | None = None
     differentiable: bool = eqx.field(static=True, default=False)
     window: Window | None = eqx.field(static=True, default=None)
@@ -238,6 +240,12 @@ class AbstractEffect(eqx.Module):
         Its mean square must be 1, so that the sigma of the read noise stays its rms. The factors of all effects
         multiply. This is how an effect shapes the read noise without knowing the effect that draws it.
         """
+        return None
+
+    def dark_current_scale(
+        self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey
+    ) -> Frames | PixelMap | None:
+        """Factor on the dark current of each pixel, as `read_noise_scale`, but of mean 1: the rate stays the mean."""
         return None
 
     def __check_init__(self):

@@ -20,4 +20,6 @@ class DarkCurrent(AbstractEffect):
     rate: Scalar = param("e-/s", low=0, doc="dark electrons of a pixel in a second")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return signal + draw_poisson(key, self.rate * capture.exposure_s, signal.shape)
+        mean = self.rate * capture.exposure_s
+        scale = capture.dark_current_scale
+        return signal + draw_poisson(key, mean if scale is None else mean * scale, signal.shape)

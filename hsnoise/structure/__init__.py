@@ -76,7 +76,7 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("short", "long") if n > 1 else ("even", "odd")
-    capture = _Capture([], [], [], [], np.zeros(1, np.uint16))
+    capture = _Capture([], [], [], [], [], np.zeros(1, np.uint16))
     for number in range(n):
         x = read_exposure(stack, layout, number, black_level_dn)
         capture.add(x, layout, halves[number], stack.white_level, alone=n == 1)
@@ -87,6 +87,7 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
         if n > 1:
             entries |= _peaks([capture.spectra[i] for i in some], f"{names[half]} exposures")
     entries |= _peaks(capture.spectra, "all exposures" if n > 1 else "all frames")
+    entries |= _shares(capture.profiles)
     if len(capture.views) > 1:
         entries |= _views.persistence(capture.views, names)
     if max(layout.frames) > 1:
@@ -102,6 +103,7 @@ class _Capture:
 
     sheets: list[Sheet]
     spectra: list[dict[str, np.ndarray]]
+    profiles: list[dict[str, np.ndarray]]
     views: list[_views.View]
     exposures: list[tuple[np.ndarray, np.ndarray]]
     outliers: np.ndarray
@@ -124,6 +126,7 @@ class _Capture:
             self.outliers = self.outliers + _views.outliers_of(x)
         self.sheets.append(sheet)
         self.spectra.append(_lines.periodograms(x))
+        self.profiles.append(_lines.static_profiles(x))
         self.exposures.append((x.mean, x.variance))
         self.views.extend(
             _views.even_and_odd(x) if alone and x.shape[1] > 1 else [_views.view_of(x, half, log_variance)]
@@ -137,6 +140,15 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
         mean = np.mean([of[group] for of in spectra if group in of], 0)
         where = "row spectrum" if group == "row x frame" else group
         out[where, f"peak of the spectrum, {half}"] = Entry(_lines.peak(mean), 0.15)
+    return out
+
+
+def _shares(profiles: list[dict[str, np.ndarray]]) -> dict[tuple[str, str], Entry]:
+    """How much one frequency has of the static rows and columns, averaged over exposures."""
+    out = {}
+    for group in dict.fromkeys(group for of in profiles for group in of):
+        mean = np.mean([of[group] for of in profiles if group in of], 0)
+        out[group, "strongest frequency"] = Entry(_lines.strongest_share(mean), 0.15)
     return out
 
 

@@ -160,10 +160,29 @@ def periodograms(x: Exposure) -> dict[str, np.ndarray]:
     frames, rows, columns = x.shape[1:]
     row = x.row_frame.reshape(step, step, frames, rows).mean(1).transpose(1, 2, 0).reshape(frames, -1)
     column = x.column_frame.reshape(step, step, frames, columns).mean(0).transpose(1, 2, 0).reshape(frames, -1)
-    still_row = x.row.reshape(step, step, rows).mean(1).T.reshape(1, -1)
-    still_column = x.column.reshape(step, step, columns).mean(0).T.reshape(1, -1)
-    series = {"row x frame": row, "column x frame": column, "static rows": still_row, "static columns": still_column}
-    return {group: _whitened(values) for group, values in series.items() if frames > 1 or "static" not in group}
+    series = {"row x frame": row, "column x frame": column, **static_profiles(x)}
+    return {group: _whitened(values) for group, values in series.items()}
+
+
+def static_profiles(x: Exposure) -> dict[str, np.ndarray]:
+    """Mean of each row and column of the whole sensor (colours mixed) over the frames, [1, line]; none of one frame."""
+    step = 1 if x.shape[0] == 1 else 2
+    _, frames, rows, columns = x.shape
+    if frames == 1:
+        return {}
+    row = x.row.reshape(step, step, rows).mean(1).T.reshape(1, -1)
+    column = x.column.reshape(step, step, columns).mean(0).T.reshape(1, -1)
+    return {"static rows": row, "static columns": column}
+
+
+def strongest_share(profile: np.ndarray) -> float:
+    """Log of the power of the two neighbouring frequencies that have most of a profile [1, line], over the mean.
+
+    A pattern of independent lines spreads over all frequencies; a period, a ramp or a shape does not. A line between
+    two frequencies of the transform shares its power between them.
+    """
+    power = np.square(np.abs(np.fft.rfft(profile[0])))[1:]
+    return float(log_ratio((power[1:] + power[:-1]).max(), power.mean()))
 
 
 def _whitened(series: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ from hsnoise.effects import (
     Crosstalk,
     DarkCurrent,
     DarkCurrentDrift,
+    DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     FrameOffset,
     Gain,
@@ -78,6 +79,7 @@ EXAMPLES = [
     HotPixels(0.2, 500.0),
     AmplifierGlow(200.0, 0.3),
     DarkCurrentDrift(60.0),
+    DarkCurrentNonuniformity(0.4),
     RandomTelegraphNoise(0.5, 8.0, 0.4),
     HeavyTailedReadNoise(6.0),
     ReadNoiseNonuniformity(0.4),
@@ -94,7 +96,7 @@ EXAMPLES = [
     BlackClamp([70.0, 60.0, 65.0]),
     Nonlinearity(1e-3),
 ]
-# Effects that draw nothing, and those that act through the read noise that another effect draws.
+# Effects that draw nothing, and those that act through what another effect draws.
 DETERMINISTIC = (
     Gain
     | BlackLevel
@@ -114,8 +116,9 @@ each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: eff
 
 
 def model_of(effect):
-    effects = [effect, ReadNoise(3.5)] if isinstance(effect, SHAPE_READ_NOISE) else [effect]
-    return NoiseModel(effects, cfa="RGGB", shutter="rolling", exposure_s=0.1)
+    shaped = [ReadNoise(3.5)] if isinstance(effect, SHAPE_READ_NOISE) else []
+    shaped += [DarkCurrent(500.0)] if isinstance(effect, DarkCurrentNonuniformity) else []
+    return NoiseModel([effect, *shaped], cfa="RGGB", shutter="rolling", exposure_s=0.1)
 
 
 def signal():

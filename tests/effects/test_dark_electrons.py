@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise.effects import AmplifierGlow, CosmicRays, DarkCurrentDrift, HotPixels
+from hsnoise.effects import (
+    AmplifierGlow,
+    CosmicRays,
+    DarkCurrent,
+    DarkCurrentDrift,
+    DarkCurrentNonuniformity,
+    HotPixels,
+    ReadNoise,
+    ShotNoise,
+)
 from hsnoise.model import NoiseModel, sample_dark
 
 KEY = jax.random.key(31)
@@ -46,6 +55,33 @@ def test_hot_pixels_are_few_exponential_and_poisson():
     np.testing.assert_array_equal(bias > 0, hot & (bias > 0))
     assert abs(bias.sum() - longer.sum() / 20) < 5 * np.sqrt(bias.sum() / 20)  # the same strengths, 1/20 of the charge
     assert np.corrcoef(bias[hot], longer[hot])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("rate", [40.0, 4e3])
+def test_dark_currents_of_pixels_are_log_normal_about_their_rate(rate):
+    frames, shape, spread = 60, (60, 80), 0.5
+    effects = [ShotNoise(), DarkCurrent(rate), DarkCurrentNonuniformity(spread)]
+    model = NoiseModel(effects, cfa="mono", shutter="rolling", exposure_s=0.5)
+    short, long = (np.asarray(sample_dark(KEY, frames, shape, model, exposure_s=t, sensor_key=KEY)) for t in (0.5, 1))
+    expected = rate * 0.5
+    relative = np.exp(spread**2) - 1
+    mean, n = short.mean(0), short[0].size
+    # Of the mean over pixels: their own spread, which is large against shot noise.
+    assert abs(mean.mean() / expected - 1) < 5 * np.sqrt((relative + 1 / (frames * expected)) / n)
+    assert abs(np.corrcoef(mean.ravel(), long.mean(0).ravel())[0, 1]) > 0.9
+    assert abs((short.var(0, ddof=1) / mean).mean() - 1) < 5 * np.sqrt(2 / (frames - 1) / n)
+    if rate > 1e3:  # shot noise of the mean over frames is 0.3 %
+        assert stats.kstest((np.log(mean / expected) + spread**2 / 2).ravel() / spread, "norm").pvalue > P_VALUE
+
+
+def test_dark_currents_of_pixels_are_the_same_with_read_noise_drawn_in_one():
+    effects = [ShotNoise(), DarkCurrent(4e3), DarkCurrentNonuniformity(0.5)]
+    models = [
+        NoiseModel(some, cfa="mono", shutter="rolling", exposure_s=1.0)
+        for some in (effects, [*effects, ReadNoise(2.0)])
+    ]
+    electrons, read = (np.asarray(sample_dark(KEY, 4, (50, 50), model, sensor_key=KEY)) for model in models)
+    assert abs((read - electrons).std() - 2.0) < 5 * 2.0 / np.sqrt(2e4)
 
 
 @pytest.mark.parametrize("corner", [None, (0.0, 0.0), (0.0, 1.0), (0.5, 0.25)])

@@ -1,0 +1,37 @@
+"""Dark current that differs between pixels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from hsnoise._types import Frames, PixelMap, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+
+
+class DarkCurrentNonuniformity(AbstractEffect):
+    """Every pixel has its own dark current, the same in all frames: log-normal, mean over pixels unchanged.
+
+    Defects and fields in the silicon differ from pixel to pixel. The factor exp(spread z - spread^2 / 2) with z normal
+    has mean 1, so the rate of the dark current stays its mean over pixels. A few pixels far above it are `hot_pixels`.
+
+    In dark frames: a grain that stays when frames are averaged and grows in proportion to exposure, with more shot
+    noise where it is bright; none in bias frames.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007 (dark current fixed pattern noise).
+    """
+
+    name: ClassVar[str] = "dark_current_nonuniformity"
+    stage: ClassVar[Stage] = Stage.ELECTRONS
+    adds: ClassVar[bool] = True
+    spread: Scalar = param("1", low=0, doc="standard deviation of ln dark current over pixels")
+
+    def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:
+        z = jax.random.normal(capture.fixed_key(self.name), (1, *shape[1:]))
+        return jnp.exp(self.spread * z - self.spread**2 / 2)
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        """The signal unchanged: the effect that draws the dark current applies the scale."""
+        return signal
