@@ -97,7 +97,7 @@ class Elements(HTMLParser):
     def __init__(self, page):
         super().__init__()
         self.tags, self.words, self.ids = [], [], []
-        self.feed(page)
+        self.feed(page.replace("<wbr>", ""))
         self.text = " ".join(" ".join(self.words).split())
 
     def handle_starttag(self, tag, attributes):

@@ -110,8 +110,7 @@ class Diagnosis:
     def __str__(self) -> str:
         table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
-            p_value = "< 1e-300" if c.p_value == 0 else f"{c.p_value:.2g}"
-            table.add_row(c.name, f"{c.score:.1f}", p_value, f"{c.misfit:.1f}")
+            table.add_row(c.name, f"{c.score:.1f}", c.chance, f"{c.misfit:.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
         console.print(table)

@@ -15,6 +15,7 @@ from hsnoise.effects import AbstractEffect
 GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
 CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
 PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
+LEAST_P = 1e-9
 LEADERS = 3  # candidates that are paired with all others
 
 
@@ -34,6 +35,11 @@ class Candidate:
     score: float
     p_value: float
     misfit: float
+
+    @property
+    def chance(self) -> str:
+        """The p-value as tables show it: below LEAST_P, tails of the statistics are not known well enough."""
+        return f"< {LEAST_P:.0e}".replace("e-0", "e-") if self.p_value < LEAST_P else f"{self.p_value:.2g}"
 
 
 @dataclass(frozen=True)

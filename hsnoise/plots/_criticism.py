@@ -64,9 +64,13 @@ def ranking(found) -> Figure:
     figure = new_figure(7.5, 0.32 * len(chosen) + 1.6, found.headline[0].upper() + found.headline[1:])
     axes = figure.subplots()
     colours = [ALARM if c.name in found.names else BAR for c in chosen]
-    axes.barh([c.name for c in chosen], [c.score for c in chosen], color=colours)
+    names = [f"{c.name}, z left {c.misfit:.1f}" for c in chosen]
+    axes.barh(names, [c.score for c in chosen], color=colours)
     _wide_scale(axes)
-    axes.set_xlabel("log-likelihood ratio against nothing missing / nats")
+    axes.set_xlabel(
+        "log-likelihood ratio against nothing missing / nats\n"
+        "(z left: worst statistics with the effect added; below 3.5 all fit)"
+    )
     tidy(axes)
     return figure
 
@@ -77,19 +81,21 @@ def story(found) -> Figure:
     Args:
         found: result of `hsnoise.improve`.
     """
-    figure = new_figure(max(5.0, 1.8 * len(found.steps) + 2.5), 4.2, "Error of the model, step by step")
-    axes = figure.subplots()
     names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
-    x = np.arange(len(names))
-    axes.plot(x, found.errors, "o-", color=BAR, markersize=8)
-    for at, error in zip(x, found.errors, strict=True):
-        axes.annotate(f"{error:.3g}", (at, error), xytext=(6, 8), textcoords="offset points", fontsize=10)
-    axes.axhline(1.0, color=FIT, linewidth=0.8, linestyle=":")
-    axes.set_yscale("log")
-    axes.set_ylim(min(0.5, 0.7 * min(found.errors)), 2.5 * max(found.errors))
-    axes.set_xlim(-0.4, len(names) - 0.4)
-    axes.set_xticks(x, names)
-    axes.set_ylabel("error (dotted: the model's own samples)")
+    figure = new_figure(6.5, 0.5 * len(names) + 1.7, "Error of the model, step by step")
+    axes = figure.subplots()
+    y = np.arange(len(names))
+    axes.plot(found.errors, y, "o-", color=BAR, markersize=8)
+    for at, error in zip(y, found.errors, strict=True):
+        axes.annotate(number(error), (error, at), xytext=(9, -9), textcoords="offset points", fontsize=10)
+    axes.axvline(1.0, color=FIT, linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    low, high = min(0.5, 0.7 * min(found.errors)), max(2.0, *found.errors)
+    axes.set_xlim(low, high * (high / low) ** 0.22)  # room for the last number
+    axes.xaxis.set_major_formatter(_plain)
+    axes.set_ylim(len(names) - 0.5, -0.6)
+    axes.set_yticks(y, names)
+    axes.set_xlabel("error (dotted: 1, the model's own samples)")
     tidy(axes)
     return figure
 

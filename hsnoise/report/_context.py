@@ -148,7 +148,7 @@ def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         {
             "name": c.name,
             "score": f"{c.score:.1f}",
-            "p": f"{c.p_value:.2g}",
+            "p": c.chance,
             "misfit": f"{c.misfit:.1f}",
             "named": c.name in diagnosis.names,
         }

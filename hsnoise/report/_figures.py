@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -30,6 +30,11 @@ from hsnoise.structure import SHORT
 SIZE_IN = (4.4, 3.1)  # of a panel: its letters can be read at the width of a phone
 STRETCH = (0.5, 99.5)  # percentiles of the measured frame that are black and white
 LINES = ("row", "column")
+
+
+def breakable(name: str) -> Markup:
+    """A parameter's name that a narrow column may break after its dots and underscores, not within a word."""
+    return Markup(str(escape(name)).replace(".", ".<wbr>").replace("_", "_<wbr>"))
 
 
 def render(
@@ -55,6 +60,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = breakable
     return environment.get_template("report.html").render(
         context,
         exposure=seconds(at.exposure_s),
