@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsnoise._frames import LazyFrames, shift_cfa, transpose_cfa
+from hsnoise._frames import LazyFrames
 from hsnoise.stack import FrameStack, as_stack, check_frame
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -22,10 +22,6 @@ def dark_counts(*shape, mean=100, dtype=np.uint16, seed=0):
 
 def lazy(counts):
     return LazyFrames([lambda i=i: counts[i] for i in range(len(counts))], counts.shape[1:], counts.dtype)
-
-
-def colour_of(cfa, row, column):
-    return cfa[2 * (row % 2) + column % 2]
 
 
 def read_all(stack, exposure=0):
@@ -346,96 +342,6 @@ def test_as_stack():
         as_stack(stack, cfa="RGGB")
     with pytest.raises(TypeError, match="hsnoise.load reads files"):
         as_stack("darks/", exposure_s=1.0)
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    cfa=st.sampled_from(("mono", *BAYER)),
-    row_axis=st.sampled_from((0, 1)),
-    row=st.integers(0, 5),
-    column=st.integers(0, 5),
-    is_lazy=st.booleans(),
-)
-def test_select_keeps_every_pixel_in_its_colour(cfa, row_axis, row, column, is_lazy):
-    counts = dark_counts(3, 10, 12)
-    whole = FrameStack(lazy(counts) if is_lazy else counts, 1.0, cfa=cfa, row_axis=row_axis)
-    part = whole.select(rows=(row, row + 4), columns=slice(column, column + 4))
-    np.testing.assert_array_equal(read_all(part), read_all(whole)[:, row : row + 4, column : column + 4])
-    if cfa != "mono":
-        for i in range(2):
-            for j in range(2):
-                assert colour_of(part.cfa, i, j) == colour_of(whole.cfa, row + i, column + j)
-
-
-def test_select_frames_and_exposures_keeps_what_is_known():
-    counts = dark_counts(3, 4, 4, 6)
-    stack = FrameStack(
-        counts,
-        [1, 2, 3],
-        kind=["dark", "flat", "flat"],
-        photons_e=[20, 30],
-        temperature_c=[5, 6, 7],
-        iso=200,
-        shutter="global",
-    )
-    part = stack.select(frames=slice(1, None, 2), exposures=[2, 0])
-    assert part.kind == ("flat", "dark") and part.iso == 200 and part.shutter == "global"
-    assert part.exposure_s.tolist() == [3, 1] and part.temperature_c.tolist() == [7, 5]
-    np.testing.assert_array_equal(part.photons_e, [30, np.nan])
-    np.testing.assert_array_equal(read_all(part, 0), counts[2, 1::2])
-    assert stack.select(exposures=[0]).photons_e is None
-
-
-@pytest.mark.parametrize("rows", [(3, 3), (-1, 4), (0, 11), slice(0, 4, 2), (5, 2)])
-def test_wrong_regions(rows):
-    with pytest.raises(ValueError, match="rows: expected"):
-        FrameStack(dark_counts(2, 10, 12), 1.0).select(rows=rows)
-
-
-def test_odd_region_of_a_bayer_sensor():
-    with pytest.raises(ValueError, match="even numbers"):
-        FrameStack(dark_counts(2, 10, 12), 1.0, cfa="RGGB").select(rows=(0, 3))
-
-
-def test_join_darks_and_flats():
-    arguments = {"cfa": "GRBG", "row_axis": 1, "black_level": [10, 20, 30], "white_level": 4095}
-    darks = FrameStack(dark_counts(2, 3, 4, 6), [1, 2], temperature_c=4, **arguments)
-    flats = FrameStack(dark_counts(2, 4, 6, mean=900), 0.5, kind="flat", photons_e=1800, **arguments)
-    both = FrameStack.join(darks, flats)
-    assert both.kind == ("dark", "dark", "flat") and both.exposure_s.tolist() == [1, 2, 0.5]
-    assert both.cfa == darks.cfa == "GBRG" and both.shape == (6, 4)
-    np.testing.assert_array_equal(both.photons_e, [np.nan, np.nan, 1800])
-    np.testing.assert_array_equal(both.temperature_c, [4, 4, np.nan])
-    np.testing.assert_array_equal(read_all(both, 2), read_all(flats))
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("cfa", "RGGB"),
-        ("shutter", "global"),
-        ("black_level", 5),
-        ("white_level", 999),
-        ("iso", 100),
-        ("row_axis", 1),
-    ],
-)
-def test_join_refuses_what_differs(name, value):
-    one, two = FrameStack(dark_counts(2, 4, 4), 1.0), FrameStack(dark_counts(2, 4, 4), 2.0, **{name: value})
-    with pytest.raises(ValueError, match=f"join: the stacks differ in {name}"):
-        FrameStack.join(one, two)
-
-
-def test_join_nothing():
-    with pytest.raises(ValueError, match="at least one"):
-        FrameStack.join()
-
-
-@given(st.sampled_from(BAYER), st.integers(0, 9), st.integers(0, 9))
-def test_bayer_orders_shift_and_transpose(cfa, rows, columns):
-    assert shift_cfa(shift_cfa(cfa, rows, columns), rows, columns) == cfa
-    assert shift_cfa(cfa, rows, columns) in BAYER
-    assert all(colour_of(transpose_cfa(cfa), i, j) == colour_of(cfa, j, i) for i in range(2) for j in range(2))
 
 
 @settings(max_examples=100, deadline=None)
