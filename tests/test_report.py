@@ -53,12 +53,12 @@ def compared(stack):
     return hsnoise.compare(PLAIN, stack, draws=8)
 
 
-def diagnosis(verdict="named", names=("row_noise",), advice=""):
+def diagnosis(verdict="named", names=("row_noise",), advice="", misfit=1.2):
     ranking = (
         Candidate("row_noise", fx.RowNoise(4.0), 812.3, 1e-9, 1.2),
         Candidate("<i>own</i>", fx.RowNoise(1.0), 12.0, 0.01, 30.0),
     )
-    left = Unexplained(1.2, "row x frame", ("row x frame: G (z = +44.0)",))
+    left = Unexplained(misfit, "row x frame", ("row x frame: G (z = +44.0)",))
     return Diagnosis(ranking, verdict, ranking[0] if names else None, names, advice, left)
 
 
@@ -123,6 +123,21 @@ def test_a_page_stands_alone(pages, command):
     assert len(ids) == len(set(ids))
     assert dict(elements.tags[[tag for tag, _ in elements.tags].index("html")][1]) == {"lang": "en"}
     assert any(a.get("name") == "viewport" for _, a in elements.tags) and "prefers-color-scheme: dark" in page
+
+
+@pytest.mark.parametrize(
+    ("names", "misfit", "words"),
+    [
+        (("row_noise",), 1.2, "No group of statistics stands out with row_noise in the model. Single statistics"),
+        (("row_noise",), 7.2, "Still far off with row_noise in the model (the worst group, row x frame, has a"),
+        ((), 1.2, "No group of statistics stands out. Single statistics that are off by more than 3"),
+        ((), 7.2, "Far off (the worst group, row x frame, has a normal score of 7.2)"),
+    ],
+)
+def test_what_is_left_is_called_so_only_if_it_stands_out(names, misfit, words, stack, compared):
+    verdict = "named" if names else "unexplained"
+    page = report.page(diagnosis(verdict, names, misfit=misfit), stack, fit=PLAIN, comparison=compared)
+    assert words in Elements(page).text
 
 
 def test_a_page_says_what_was_found(pages, compared):

@@ -68,6 +68,11 @@ class Unexplained:
     group: str
     statistics: tuple[str, ...]
 
+    @property
+    def stands_out(self) -> bool:
+        """Whether a group as a whole is off by more than chance; single statistics among hundreds may be."""
+        return self.misfit > MISFIT_LEFT
+
 
 @dataclass(frozen=True)
 class Diagnosis:
