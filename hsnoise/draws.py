@@ -86,7 +86,7 @@ def check_effects(model: NoiseModel, like: FrameStack) -> None:
         bad = ~np.isfinite(values)
         if bad.any():
             raise ValueError(
-                f"{effect.name}: its sample returned NaN or infinity in {100 * bad.mean():.2g} % of the pixels."
+                f"{effect.name}: its sample returned NaN or infinity in {100 * bad.mean():.3g} % of the pixels."
             )
         typical = float(np.sqrt(np.mean(values**2)))
         if typical > MOST_RANGES * largest:

@@ -22,11 +22,12 @@ from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import Gaussian, shrunk
+from hsnoise.criticism.nearest import nearest
 from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pairs, closest, judge
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined, refined_pair, score_with_base
 from hsnoise.draws import check_effects, check_fits, part_of
-from hsnoise.effects import AbstractEffect
+from hsnoise.effects import EFFECTS, AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
@@ -48,9 +49,10 @@ WORST = 5
 LEGEND = (
     "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
     " is meant); z left: normal score of the worst group of statistics with it in the model (below 3.5 nothing stands"
-    " out)"
+    " out); p: chance of such a score if nothing is missing"
 )
-NEXT = "next: hsnoise improve, or in Python hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
+NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
+NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
 SIDES = "whether {} arises before or behind the gain is a first guess: improve fits both and keeps the likelier"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
@@ -85,6 +87,8 @@ class Diagnosis:
         names: those that the verdict names: two if it is "ambiguous", or if two effects are missing together.
         advice: the capture that would decide, or what to look at next.
         unexplained: what remains.
+        nearest: if none explains the capture, the effects that explain most statistics, best first; `improve` tries
+            them. Scores of the ranking mean little there.
     """
 
     ranking: tuple[Candidate, ...]
@@ -93,6 +97,7 @@ class Diagnosis:
     names: tuple[str, ...]
     advice: str
     unexplained: Unexplained
+    nearest: tuple[Candidate, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -120,13 +125,20 @@ class Diagnosis:
         console.print(self.headline, highlight=False)
         console.print(table)
         sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
-        after = [self.advice, *sides, NEXT if self.best is not None else ""]
+        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
+        after = [self.advice, others, *sides, self._next()]
         for sentence in (LEGEND, *map(_described, self.named), *after):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _next(self) -> str:
+        if self.best is None:
+            return ""
+        of_users = type(self.best.effect) not in EFFECTS
+        return f"next: {NEXT_OWN if of_users else NEXT}hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
 
 
 def _described(candidate: Candidate) -> str:
@@ -171,7 +183,8 @@ def diagnose(
         check_effects(model.add(made(maker, 1.0, 0)), part)
     makers = {name: maker for name, maker in built_in(model, part).items() if name not in own}
     bench = Bench(model, part, reference(model, part, draws, seed, tick), seed, tick)
-    null = shrunk(bench.base.own_z(), bench.slopes())
+    slopes = bench.slopes()
+    null = shrunk(bench.base.own_z(), slopes)
     z = bench.base.z(measure(part, model).values)
     evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
@@ -193,7 +206,10 @@ def diagnose(
             found = _verdict(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, laws)
             if found.best is candidate:
                 found = replace(found, unexplained=_what_remains(left, law))
-    return found
+    if found.verdict != "unexplained":
+        return found
+    prints = [one.of for one in judged]
+    return replace(found, nearest=nearest(prints, found.ranking, z, slopes, np.diagonal(bench.base.law.covariance)))
 
 
 def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:
@@ -331,7 +347,7 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
     if verdict == "nothing missing" or (verdict == "unexplained" and not partly):
         law = evidence.null
     blamed, remaining = _what_remains(evidence, evidence.null).group, _what_remains(evidence, law)
-    nearest = names if partly else ()
+    partner = names if partly else ()
     if verdict in ("nothing missing", "unexplained"):
         names = ()
     return Diagnosis(
@@ -339,7 +355,7 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
         verdict=verdict,
         best=first if names else None,
         names=names,
-        advice=_advice(verdict, names or nearest, first, blamed, remaining.group),
+        advice=_advice(verdict, names or partner, first, blamed, remaining.group),
         unexplained=remaining,
     )
 

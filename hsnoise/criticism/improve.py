@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hsnoise._arguments import callback, counter, seed_of
 from hsnoise.criticism.compare import Comparison, compare
-from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
+from hsnoise.criticism.diagnose import Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_effects, check_fits, darks_of
@@ -26,7 +26,7 @@ from hsnoise.synthetic import fit_synthetic
 
 CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 MOST_STEPS = 8
-MOST_TRIED = 2  # effects, where none explains all
+MOST_TRIED = 4  # effects, where none explains all
 HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
@@ -290,7 +290,7 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
         return tuple(alike) if found.verdict == "ambiguous" else (found.best,)
     if found.verdict == "nothing missing":
         return ()
-    return tuple(one for one in found.ranking[:MOST_TRIED] if one.score > EVIDENCE)
+    return found.nearest[:MOST_TRIED]
 
 
 def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
