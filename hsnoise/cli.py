@@ -26,7 +26,7 @@ from hsnoise._progress import busy, fit_with_progress
 from hsnoise._table import table_of
 from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
-from hsnoise.draws import check_fits
+from hsnoise.draws import check_fits, part_of
 from hsnoise.effects import RowNoise
 from hsnoise.fit import FitResult
 from hsnoise.model import NoiseModel
@@ -162,6 +162,7 @@ def _compare(args: argparse.Namespace) -> None:
 def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args.paths, args)
+    part_of(stack)  # flats alone are no capture to diagnose: said before the fit
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = fit_with_progress(stack, args.method) if args.model is None else _model(args.model)
     with busy("Drawing every effect that may be missing") as say:
@@ -245,7 +246,10 @@ def _load(paths: list[str], args: argparse.Namespace) -> FrameStack:
         for group in groups:
             _tell_exposures(group)
     if args.flats:
-        groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
+        try:
+            groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"--flats: {str(error).removeprefix('path: ')}") from error
     return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
 
 
@@ -295,7 +299,7 @@ def _model(name: str) -> NoiseModel:
     if name in CAMERAS:
         return CAMERAS[name]()
     if not Path(name).is_file():
-        raise ValueError(f"model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
+        raise ValueError(f"--model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
     return NoiseModel.load(name)
 
 

@@ -28,6 +28,11 @@ SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
 NOT_CONVERGED = "NOT CONVERGED: "
+EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
+AT_EDGE = (
+    "{} lies at a step of the likelihood, where the rows whose gain the model clips at 0 are rounded to the next count:"
+    " it is known to half a count only. Such rows are a sign of an effect that the model lacks: hsnoise.compare tells."
+)
 WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
 
 
@@ -167,6 +172,9 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         grown = np.maximum(profile_errors(coordinates, maximum, summary) / deviation, 1.0)
         covariance = covariance * grown[:, None] * grown[None, :]
         covariance = covariance + _of_hidden_dark_level(covariance, names, maximum.physics, summary)
+    edges = _edges(covariance, names, maximum.physics, summary)
+    grown = np.where(edges, EDGE_DN / np.sqrt(np.diagonal(covariance)), 1.0)
+    covariance = covariance * grown[:, None] * grown[None, :]
     kept = [i for i, name in enumerate(names) if not name.startswith("outliers")]  # shares of outliers are nuisances
     result = FitResult(
         params=_model_with(maximum.physics, summary, model),
@@ -180,7 +188,24 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         notes=(),
         summary=summary,
     )
-    return result.with_notes(closing_notes(result)), maximum.converged
+    at_edges = tuple(AT_EDGE.format(name) for name, edge in zip(names, edges, strict=True) if edge)
+    return result.with_notes((*at_edges, *closing_notes(result))), maximum.converged
+
+
+def _edges(covariance: np.ndarray, names, physics: Physics, summary: Summary) -> np.ndarray:
+    """Which parameters are black levels that seem better known than the mean of all pixels tells them [parameter].
+
+    Rows whose gain the model clips at 0 put all their pixels on one count, and the likelihood jumps where the black
+    level would be rounded to another: close to such a step its curvature says nothing of the error.
+    """
+    edges = np.zeros(len(names), bool)
+    for h, gain in zip(summary.histograms, np.broadcast_to(physics.gain, len(summary.histograms)), strict=True):
+        name = "black_level" if h.channel == "mono" else f"black_level.{h.channel}"
+        noise_dn = float(gain * physics.read_noise)
+        if name in names and noise_dn > EDGE_DN:  # finer noise does tell where the steps are
+            i = names.index(name)
+            edges[i] = np.sqrt(covariance[i, i]) < 0.3 * noise_dn / np.sqrt(h.row_pixels.sum())
+    return edges
 
 
 def _of_hidden_dark_level(covariance: np.ndarray, names, physics: Physics, summary: Summary) -> np.ndarray:

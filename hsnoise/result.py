@@ -125,7 +125,7 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     if not (np.isfinite(error) and error > 0):
         return f"{value:.5g}", "given" if error == 0 else "not determined"
     digits = max(1 if 0 < abs(value) < 10 else 0, 1 - int(np.floor(np.log10(error))))
-    if digits > 6 or error >= 1e4:
+    if digits > 6 and abs(value) < 1e-4 or error >= 1e4:
         return f"{value:.3e}", f"{error:.1e}"
     return f"{value:.{digits}f}", f"{error:.{digits}f}"
 

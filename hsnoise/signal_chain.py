@@ -32,6 +32,10 @@ def signals(key, light, shape, effects, capture):
     for effect in effects:
         try:
             drawn = _sample_one(key, signal, shape, effect, capture)
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+            raise TypeError(
+                f"{effect.name}: JAX cannot compile its sample; use jax.numpy instead of numpy, jnp.where instead of if"
+            ) from error
         except Exception as error:
             error.add_note(f"in the sample of the effect {effect.name}")
             raise

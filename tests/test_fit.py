@@ -385,3 +385,15 @@ def test_rows_that_conflict_with_the_start_do_not_end_a_fit():
     counts = simulator.capture(simulator.CAMERAS["canon"], hidden, 1.0, np.random.default_rng(4))
     result = hsnoise.fit(counts, exposure_s=EXPOSURE_S, black_level=0, white_level=65535, cfa="RGGB", shutter="rolling")
     assert result.method == "ml" and result.outcome.startswith("converged")
+
+
+@pytest.mark.data
+def test_a_black_level_at_a_step_of_the_likelihood_is_known_to_half_a_count_only(shared_data):
+    """Row noise taken for row gain: the model clips the gain of rows at 0, which lie on one count then."""
+    with np.load(shared_data / "cases" / "case_c.npz") as data:
+        known = {name: str(data[name]) for name in ("cfa", "shutter")}
+        result = hsnoise.fit(data["counts"], exposure_s=data["exposure_s"], **known)
+    value, error, _ = result.table["black_level.R"]
+    assert abs(value - 63.5) < 0.01 and error == pytest.approx(0.5)
+    assert any("black_level.R lies at a step of the likelihood" in note for note in result.notes)
+    assert 1e-3 < result.table["black_level.G"][1] < 0.1

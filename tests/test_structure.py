@@ -242,6 +242,22 @@ def test_statistic_reacts_to_its_effect(effect, name, sign):
     assert sign * (found.values[i] - mean[i]) > 5 * spread[i]
 
 
+def test_noise_that_comes_in_bursts_of_rows_is_told(rng):
+    shape = (96, 128)
+    plain = noise(rng, (8, 8), shape)
+    counts = []
+    for exposure in plain.counts:
+        row, start = np.arange(shape[0])[None, :, None], rng.integers(0, 80, (8, 1, 1))
+        burst = (row >= start) & (row < start + 15)
+        counts.append(np.rint(exposure + burst * rng.normal(0, 3.0, exposure.shape)).clip(0).astype(np.uint16))
+    hit = hsnoise.FrameStack(counts, plain.exposure_s, black_level=64.0)
+    found, clean = structure(hit, np.array(64.0)), structure(plain, np.array(64.0))
+    for what, least in (("spread", 5), ("next row of the colour", 5)):
+        i = found.names.index(f"blocks: noise of rows, {what}, short exposures")
+        assert abs(clean.values[i]) < 4 * clean.error[i]
+        assert found.values[i] > least * found.error[i]
+
+
 # At half a cycle a line, the colours of a Bayer sensor see an offset, not a line.
 LINES = [(cfa, *line) for cfa in ("mono", "RGGB") for line in (("row", 0.288), ("column", 0.041), ("column", 0.3333))]
 

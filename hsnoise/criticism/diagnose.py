@@ -146,11 +146,10 @@ def _described(candidate: Candidate) -> str:
     effect = candidate.effect
     values = []
     for field, spec in effect.specs().items():
-        value = np.array2string(np.asarray(getattr(effect, field)), precision=3)
+        value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
         values.append(f"{field} {value}" if spec.unit == "1" else f"{field} {value} {spec.unit}")
     values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
-    about = (type(effect).__doc__ or "").strip().partition("\n")[0]
-    return f"{effect.name}: {about} First estimate: {', '.join(values)}."
+    return f"{effect.name}: {effect.about()} First estimate: {', '.join(values)}."
 
 
 def diagnose(

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hsnoise._arguments import callback, counter, seed_of
 from hsnoise.criticism.compare import Comparison, compare
-from hsnoise.criticism.diagnose import Diagnosis, check_candidates, diagnose, not_in
+from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_effects, check_fits, darks_of
@@ -55,6 +55,11 @@ class Step:
     added: str | None
     held_out: float
     moved: tuple[str, ...]
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """What was fitted of the effect that was added, and what was chosen for it, in words."""
+        return () if self.added is None else _sizes(self.fit, self.added)
 
 
 @dataclass(frozen=True)
@@ -119,9 +124,7 @@ class Story:
                     f" -> {step.comparison.error:.2f}.",
                     highlight=False,
                 )
-                for sentence in _size(step.fit, step.added):
-                    console.print(f"  {sentence}", highlight=False)
-            for sentence in step.moved:
+            for sentence in (*step.sizes, *step.moved):
                 console.print(f"  {sentence}", highlight=False)
         for sentence in (self.ended, self.split):
             if sentence:
@@ -219,8 +222,7 @@ class _Work:
         return self.step(best, candidate.name, steps[-1])
 
 
-def _size(result: FitResult, name: str) -> list[str]:
-    """What was fitted of an effect that was added, and what was chosen for it, in words."""
+def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
     rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
     told = []
     for label, (value, error, unit) in rows:
@@ -229,7 +231,7 @@ def _size(result: FitResult, name: str) -> list[str]:
         told.append(f"{label} = {size} {of}{'' if unit == '1' else f' {unit}'}")
     chosen = result.params[name].settings().items()
     told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
-    return [f"{sentence}." for sentence in told]
+    return tuple(f"{sentence}." for sentence in told)
 
 
 def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
@@ -290,7 +292,9 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
         return tuple(alike) if found.verdict == "ambiguous" else (found.best,)
     if found.verdict == "nothing missing":
         return ()
-    return found.nearest[:MOST_TRIED]
+    names = [one.name for one in found.nearest]
+    others = [one for one in found.ranking if one.score > EVIDENCE and one.name not in names]
+    return (*found.nearest, *others)[:MOST_TRIED]
 
 
 def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.criticism.candidates import made
-from hsnoise.criticism.fingerprint import RELATIVE_ERROR, Fingerprint
+from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.ranking import GRID, Candidate
 
 FREEDOM = 4.0
@@ -42,7 +42,7 @@ def nearest(
 def _best(of: Fingerprint, z: np.ndarray, slopes: np.ndarray, variance: np.ndarray) -> tuple[float, float, int]:
     """Least loss over amplitudes and details: (loss, amplitude, detail)."""
     return min(
-        (_loss(z - shift, slopes, variance + (RELATIVE_ERROR * shift) ** 2), float(amplitude), detail)
+        (_loss(z - shift, slopes, variance), float(amplitude), detail)
         for amplitude in GRID[::2]
         for detail, shift in enumerate(of.at(float(amplitude)))
     )

@@ -249,6 +249,10 @@ class AbstractEffect(eqx.Module):
         return None
 
     def __check_init__(self):
+        if not (isinstance(self.name, str) and self.name.isidentifier()):
+            raise ValueError(f"name: expected that of an effect in lower case, such as row_noise, got {self.name!r}.")
+        if not isinstance(self.stage, Stage):
+            raise TypeError(f"{self.name}.stage: expected one of Stage, such as Stage.READ, got {self.stage!r}.")
         after_gain = getattr(self, "after_gain", False)
         if not isinstance(after_gain, bool):
             raise ValueError(f"{self.name}.after_gain: expected True or False, got {after_gain!r}.")
@@ -271,6 +275,11 @@ class AbstractEffect(eqx.Module):
         """Declared parameters: field name to declaration, in order."""
         declared = {field.name: field.metadata.get("parameter") for field in dataclasses.fields(cls)}
         return {name: spec for name, spec in declared.items() if spec is not None}
+
+    @classmethod
+    def about(cls) -> str:
+        """What it is: the first line of its docstring."""
+        return (cls.__doc__ or "").strip().partition("\n")[0]
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{field.name}={_shown(getattr(self, field.name))}" for field in dataclasses.fields(self))

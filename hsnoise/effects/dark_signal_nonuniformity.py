@@ -14,7 +14,8 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 class DarkSignalNonuniformity(AbstractEffect):
     """Offset of each pixel, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
 
-    Thresholds of the pixels' transistors differ. What grows with exposure instead is `hot_pixels`.
+    Thresholds of the pixels' transistors differ. What grows with exposure instead is `dark_current_nonuniformity`
+    or `hot_pixels`.
 
     In dark frames: a grain that stays when frames are averaged, equally strong in all exposures.
 

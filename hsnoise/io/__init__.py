@@ -121,7 +121,7 @@ def _paths(path: Any) -> list[Path]:
         raise FileNotFoundError(f"path: no capture in {path!s}; known formats: {' '.join(_READERS.values())}")
     for one in paths:
         if not one.is_file():
-            raise FileNotFoundError(f"path: no such file: {one}")
+            raise FileNotFoundError(f"path: no such file or folder: {one}")
     return paths
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ def read(path: Path) -> list[Recording]:
     with naming(path):
         if path.suffix.lower() == ".npy":
             return recordings(path, _groups(np.load(path, mmap_mode="r")), {})
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no .npz file, or one that was cut off")
         with path.open("rb") as file, np.load(file) as arrays:
             if "counts" not in arrays:
                 raise ValueError(f"expected an array 'counts', got {sorted(arrays)}")

@@ -161,6 +161,8 @@ def steps(story: Story) -> list[dict[str, Any]]:
     return [
         {
             "added": after.added,
+            "what": after.fit.params[after.added].about(),
+            "sizes": after.sizes,
             "why": _why(before),
             "before": number(before.comparison.error),
             "after": number(after.comparison.error),

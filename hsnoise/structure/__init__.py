@@ -114,6 +114,7 @@ class _Capture:
         _lines.variances(sheet, x)
         _lines.colours(sheet, x)
         _lines.scales(sheet, x)
+        _lines.noise_of_rows(sheet, x)
         _lines.spectra(sheet, x)
         _pixels.lags(sheet, x)
         _pixels.tails(sheet, x)

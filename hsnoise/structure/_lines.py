@@ -6,7 +6,7 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 from hsnoise.structure._anova import Exposure
-from hsnoise.structure._sheet import Sheet, correlation, fisher, log_ratio
+from hsnoise.structure._sheet import ABS_VARIANCE, Sheet, correlation, fisher, log_ratio
 
 BANDS = 5
 HAAR_LEVELS = 6
@@ -102,6 +102,16 @@ def scales(sheet: Sheet, x: Exposure) -> None:
         still, noise = ((z @ basis.T).astype(np.float64) for z in (profile.sum(0), moving.sum(0)))
         value = log_ratio((still**2).sum() * frames, (noise**2).sum() / (frames - 1))
         sheet.add(group, "low-order shape", value, np.sqrt(2 / 3 * frames / (frames - 1)))
+
+
+def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
+    """Whether the noise of single rows differs from frame to frame, and that of neighbours together (interference)."""
+    planes, frames, rows, columns = x.shape
+    spread = np.log(x.scale)
+    spread = (spread - spread.mean((1, 2), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
+    n = planes * frames * rows
+    sheet.add("blocks", "noise of rows, spread", log_ratio(np.square(spread).mean((1, 2)), 1.0), np.sqrt(2 / n))
+    sheet.add("blocks", "noise of rows, next row of the colour", _next(spread, 2), 1 / np.sqrt(n))
 
 
 def _haar(profile: np.ndarray) -> list[np.ndarray]:

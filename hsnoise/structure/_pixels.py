@@ -6,13 +6,12 @@ import numpy as np
 
 from hsnoise.structure._anova import BOUND, Exposure
 from hsnoise.structure._lines import cosines
-from hsnoise.structure._sheet import TINY_DN2, Sheet, correlation, fisher, log_ratio
+from hsnoise.structure._sheet import ABS_VARIANCE, TINY_DN2, Sheet, correlation, fisher, log_ratio
 
 LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2), (0, 4), (4, 0))
 STATIC_LAGS = ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
 TAILS = (4.5, 7.0, 15.0, -4.0, -6.0)
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999)
-ABS_VARIANCE = 1 - 2 / np.pi  # of |x| of a standard normal x
 GRID = 8
 FEWEST_PER_CODE = 8.0
 FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])

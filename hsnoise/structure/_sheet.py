@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+ABS_VARIANCE = 1 - 2 / np.pi  # of |x| of a standard normal x
 TINY_DN2 = 1e-4  # far below the variance of rounding: keeps logarithms of empty variances finite
 LARGEST_CORRELATION = 0.9999
 

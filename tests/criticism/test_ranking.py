@@ -12,6 +12,7 @@ from hsnoise import effects as fx
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.nearest import nearest
 from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pairs, closest, judge
 
 verdicts = importlib.import_module("hsnoise.criticism.diagnose")  # the package has a function of that name
@@ -147,3 +148,25 @@ def test_an_effect_that_explains_a_part_is_named_in_the_advice():
     partly, hardly = verdict(9.0, None), verdict(18.0, None)
     assert "left would explain part" in partly.advice and partly.unexplained.misfit == pytest.approx(9.0, abs=0.5)
     assert "none comes near" in hardly.advice and hardly.unexplained.misfit == pytest.approx(20.0, abs=0.5)
+
+
+def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are():
+    """A wide effect scatters statistics that something else has moved; another explains its own exactly."""
+    z = evidence(PRINTS[0]).z
+    z[30:38] += 300.0
+    rng = np.random.default_rng(3)
+    wild = np.zeros(STATISTICS)
+    wild[25:38] = 1.0
+    scattered = np.array(AMPLITUDES)[:, None, None] * wild * 60 * rng.standard_normal((3, 4, STATISTICS))
+    wide = Fingerprint("wide", lambda amplitude, rng: fx.RowNoise(amplitude), AMPLITUDES, scattered)
+    prints = [PRINTS[0], wide]
+    found = Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), NAMES, GROUPS, 2)
+    judged = sorted((judge(of, found) for of in prints), key=lambda one: -one.score)
+    ranking = [one.candidate(found) for one in judged]
+    assert [one.name for one in ranking] == ["wide", "left"]  # by normal laws, far from any of them
+    no_base, ones = np.zeros((1, STATISTICS)), np.ones(STATISTICS)
+    assert nearest(prints, ranking, z, no_base, ones)[0].name == "left"
+    # What a wrong base parameter would do is no gain.
+    base = PRINTS[0].at(1.0).mean(0)[None]
+    assert "left" not in [one.name for one in nearest(prints, ranking, z, base, ones)]
+    assert nearest(prints, ranking, evidence().z, no_base, ones) == ()

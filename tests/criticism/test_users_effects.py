@@ -67,6 +67,29 @@ def test_fault_in_the_code_of_an_effect_is_told_with_its_name():
     assert "in the sample of the effect my_effect" in raised.value.__notes__
 
 
+@pytest.mark.parametrize(
+    "change", [lambda signal: np.sort(signal), lambda signal: signal if signal[0, 0, 0] > 1 else 0]
+)
+def test_an_effect_that_jax_cannot_compile_is_named(change):
+    with pytest.raises(TypeError, match="my_effect: JAX cannot compile its sample; use jax.numpy"):
+        CALLS["compare"](Mine(change))
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("name", "", "name: expected that of an effect .* got ''"),
+        ("name", "a.b c", "name: expected that of an effect .* got 'a.b c'"),
+        ("name", 3, "name: expected that of an effect .* got 3"),
+        ("stage", "read", "my_effect.stage: expected one of Stage, such as Stage.READ, got 'read'"),
+    ],
+)
+def test_a_wrong_name_or_stage_is_told_at_once(attribute, value, message, monkeypatch):
+    monkeypatch.setattr(Mine, attribute, value)
+    with pytest.raises((ValueError, TypeError), match=message):
+        Mine(lambda signal: signal)
+
+
 def test_candidates_of_one_name_or_in_the_model_are_refused():
     effect = Mine(lambda signal: signal + 1)
     for call in (hsnoise.diagnose, lambda model, *rest, **keywords: hsnoise.improve(*rest, model=model, **keywords)):

@@ -40,7 +40,7 @@ def test_folder_glob_list_and_file(tmp_path):
 
 
 def test_paths_that_lead_nowhere(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such file: .*none.dng"):
+    with pytest.raises(FileNotFoundError, match="no such file or folder: .*none.dng"):
         load(tmp_path / "none.dng")
     for path in (tmp_path, f"{tmp_path}/*.dng", []):
         with pytest.raises(FileNotFoundError, match="no capture in .*known formats: .dng"):

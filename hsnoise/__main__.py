@@ -1,0 +1,7 @@
+"""`python -m hsnoise` is the command line."""
+
+import sys
+
+from hsnoise.cli import main
+
+sys.exit(main())
