@@ -70,13 +70,14 @@ def _loop_arguments(commands: Any) -> None:
     diagnose = commands.add_parser(
         "diagnose",
         help="learn which physical effect a model lacks",
-        description="Name the effect that a fitted model lacks. Without --model the frames are fitted first.",
+        description="Name the effect that a fitted model lacks, in one to five minutes. Without --model the frames are "
+        "fitted first.",
     )
     improve = commands.add_parser(
         "improve",
         help="fit, find what is missing, add it, until nothing is left",
         description="The whole loop: fit the frames, find the effect that the model lacks, add it and fit again, until "
-        "nothing significant is left. Writes model.json, table.csv, story.txt and a figure to a folder.",
+        "nothing significant is left: 5 to 20 minutes. Writes model.json, table.csv, story.txt and a figure to a folder.",
     )
     for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):
         if name == "diagnose":
@@ -111,17 +112,21 @@ def _method_argument(parser: argparse.ArgumentParser) -> None:
 def _capture_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("what the files do not say", "each overrides what the files say")
     group.add_argument("--exposure", type=_numbers, metavar="S[,S...]", help="exposure in seconds, one or one per file")
-    group.add_argument("--kind", choices=("dark", "flat"), help="what the frames are, if not dark")
+    group.add_argument("--kind", choices=("dark", "flat"), help="what the frames are (default: dark)")
     group.add_argument("--cfa", type=_cfa, metavar="CFA", help=f"mono or the Bayer order: {', '.join(BAYER_CFAS)}")
     group.add_argument("--black-level", type=_numbers, metavar="DN[,DN,DN]", help="one, or one for each of R, G, B")
     group.add_argument("--white-level", type=float, metavar="DN", help="count at which the sensor saturates")
-    group.add_argument("--shutter", choices=SHUTTERS)
+    group.add_argument(
+        "--shutter",
+        choices=SHUTTERS,
+        help="how the sensor is read (default: rolling); the gain of rows fluctuates as 1/f then, else white",
+    )
     group.add_argument(
         "--row-axis",
         type=int,
         choices=(0, 1),
         default=0,
-        help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait",
+        help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait (default: 0)",
     )
     group.add_argument("--roi", type=_roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")

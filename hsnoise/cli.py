@@ -53,7 +53,7 @@ MEANING = """\
 One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
-errors do not say: whether the model is right; look at the residuals in histograms.png."""
+errors do not say: whether the model is right. Look at the residuals in histograms.png, and run hsnoise compare."""
 
 
 def main(argv: list[str] | None = None) -> int:
