@@ -8,26 +8,37 @@ systems", Nature 466, 2010), and a verdict is given only if the winner also expl
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from hsnoise._arguments import callback, listed, seed_of, whole_number
+from hsnoise._threads import in_threads
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
+from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.nearest import nearest
-from hsnoise.criticism.ranking import CLOSE, LEADERS, Candidate, Evidence, Judged, Pair, best_pairs, closest, judge
+from hsnoise.criticism.ranking import (
+    CLOSE,
+    EVIDENCE,
+    LEADERS,
+    Candidate,
+    Evidence,
+    Judged,
+    Pair,
+    best_pairs,
+    closest,
+    judge,
+    limit_by_chance,
+)
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined, refined_pair, score_with_base
-from hsnoise.draws import check_effects, check_fits, part_of
-from hsnoise.effects import EFFECTS, AbstractEffect
+from hsnoise.draws import check_effects, check_fits, draw_capture, part_of
+from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import as_stack
@@ -39,117 +50,16 @@ MOST_PAIRS = 3  # that are refined, two effects at once
 NEAR = 0.8  # share of the best score that makes a candidate a leader
 MANY_DETAILS = 16  # of which the leaders' best are taken
 AROUND, CLOSE_DETAILS = (0.6, 1.0, 1.6), 10  # amplitudes, relative, at which the leaders are drawn again
-EVIDENCE = 8.0  # log-likelihood ratio from which an effect is there: by chance in 1 of 100 captures, of 26 candidates
+SURE = 40.0  # nats that need no comparison with what chance gives
+CHANCE_SEEDS = 50_000  # of the draws for that, beyond the seed
 MISFIT = 4.5  # normal score of the worst group from which something is there
 # What the winner may leave of it: fingerprints of strong effects are known to some percent only.
-MISFIT_LEFT, SHARE_LEFT, MOST_LEFT = 3.5, 0.05, 10.0
+SHARE_LEFT, MOST_LEFT = 0.05, 10.0
 NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a part of the explanation
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
-WORST = 5
-LEGEND = (
-    "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
-    " is meant); z left: normal score of the worst group of statistics with it in the model (below 3.5 nothing stands"
-    " out); p: chance of such a score if nothing is missing"
-)
-NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
-NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
-SIDES = "whether {} arises before or behind the gain is a first guess: improve fits both and keeps the likelier"
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
 LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """What remains: the worst group's normal score, and the statistics that are far off, with their z.
-
-    Beyond what the diagnosis names, or what comes nearest if that explains half of it; else beyond the model.
-    """
-
-    misfit: float
-    group: str
-    statistics: tuple[str, ...]
-
-    @property
-    def stands_out(self) -> bool:
-        """Whether a group as a whole is off by more than chance; single statistics among hundreds may be."""
-        return self.misfit > MISFIT_LEFT
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What `diagnose` found.
-
-    Attributes:
-        ranking: candidates, best first; two that explain the capture only together come before all others.
-        verdict: "nothing missing", "named", "ambiguous" or "unexplained".
-        best: the first candidate if the verdict is "named" or "ambiguous", else None.
-        names: those that the verdict names: two if it is "ambiguous", or if two effects are missing together.
-        advice: the capture that would decide, or what to look at next.
-        unexplained: what remains.
-        nearest: if none explains the capture, the effects that explain most statistics, best first; `improve` tries
-            them. Scores of the ranking mean little there.
-    """
-
-    ranking: tuple[Candidate, ...]
-    verdict: str
-    best: Candidate | None
-    names: tuple[str, ...]
-    advice: str
-    unexplained: Unexplained
-    nearest: tuple[Candidate, ...] = ()
-
-    @property
-    def headline(self) -> str:
-        """The verdict in a few words: "missing: row_noise and hot_pixels"."""
-        if not self.names:
-            return self.verdict
-        return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
-
-    @property
-    def named(self) -> tuple[Candidate, ...]:
-        """The candidates that the verdict names."""
-        return tuple(c for c in self.ranking if c.name in self.names)
-
-    def plot(self):
-        """A figure of the ranking: `hsnoise.plots.ranking`."""
-        from hsnoise import plots  # matplotlib is slow to import
-
-        return plots.ranking(self)
-
-    def __str__(self) -> str:
-        table = Table("effect", "score / nats", "p", "z left")
-        for c in self.ranking[:WORST]:
-            table.add_row(c.name, f"{c.score:.1f}", c.chance, f"{c.misfit:.1f}")
-        console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(self.headline, highlight=False)
-        console.print(table)
-        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
-        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
-        after = [self.advice, others, *sides, self._next()]
-        for sentence in (LEGEND, *map(_described, self.named), *after):
-            if sentence:
-                console.print(f"- {sentence}", highlight=False)
-        return console.file.getvalue().rstrip()
-
-    __repr__ = __str__
-
-    def _next(self) -> str:
-        if self.best is None:
-            return ""
-        of_users = type(self.best.effect) not in EFFECTS
-        return f"next: {NEXT_OWN if of_users else NEXT}hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
-
-
-def _described(candidate: Candidate) -> str:
-    """What an effect is, and the first estimate of its parameters."""
-    effect = candidate.effect
-    values = []
-    for field, spec in effect.specs().items():
-        value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
-        values.append(f"{field} {value}" if spec.unit == "1" else f"{field} {value} {spec.unit}")
-    values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
-    return f"{effect.name}: {effect.about()} First estimate: {', '.join(values)}."
 
 
 def diagnose(
@@ -188,6 +98,8 @@ def diagnose(
     evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
     pair = None
+    if EVIDENCE < judged[0].score < SURE:
+        evidence = replace(evidence, limit=_limit(judged, draws, bench, evidence))
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
         judged = _looked_at(judged, len(judged), bench, evidence)
         judged = _closer(judged, bench, evidence)
@@ -209,6 +121,17 @@ def diagnose(
         return found
     prints = [one.of for one in judged]
     return replace(found, nearest=nearest(prints, found.ranking, z, slopes, np.diagonal(bench.base.law.covariance)))
+
+
+def _limit(judged: list[Judged], draws: int, bench: Bench, evidence: Evidence) -> float:
+    """Score that chance gives in hardly any capture like this one, from as many fresh draws of the model."""
+
+    def z(number: int) -> np.ndarray:
+        drawn = draw_capture(bench.seed + CHANCE_SEEDS + number, bench.model, bench.part)
+        return bench.base.z(measure(drawn, bench.model).values)
+
+    fresh = np.stack(in_threads(z, range(draws), bench.tick))
+    return limit_by_chance([one.of for one in judged], evidence.null, fresh)
 
 
 def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:
@@ -334,15 +257,15 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
         ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
         first = ranking[0]
     verdict = "named"
-    if first.score <= EVIDENCE and worst <= MISFIT:
+    if first.score <= evidence.limit and worst <= MISFIT:
         verdict = "nothing missing"
-    elif first.score <= EVIDENCE or left > allowed:
+    elif first.score <= evidence.limit or left > allowed:
         verdict = "unexplained"
     elif first.name in ALIKE and not evidence.has_flats:
         verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
     elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
         verdict, names = "ambiguous", (first.name, second.name)
-    partly = first.score > EVIDENCE and left < NEAR_ENOUGH * worst
+    partly = first.score > evidence.limit and left < NEAR_ENOUGH * worst
     if verdict == "nothing missing" or (verdict == "unexplained" and not partly):
         law = evidence.null
     blamed, remaining = _what_remains(evidence, evidence.null).group, _what_remains(evidence, law)

@@ -8,6 +8,9 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 
+HARDLY_VARIES = 0.25  # variance of z over draws
+
+
 @dataclass(frozen=True)
 class Gaussian:
     """Normal(mean, covariance) of statistics [statistic]."""
@@ -52,6 +55,9 @@ def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
     n, d = z.shape
     centred = z - z.mean(0)
     sample = centred.T @ centred / n
+    # Units of z are kept from vanishing: what hardly varies in the draws is not known to vary so little in captures.
+    hardly = np.diagonal(sample) < HARDLY_VARIES
+    sample[np.ix_(hardly, hardly)] = np.eye(hardly.sum())
     target = np.diag(np.diagonal(sample))
     distance = ((sample - target) ** 2).sum()
     squares = (centred**2).T @ (centred**2) / n - sample**2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,6 +17,9 @@ GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
 CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
 PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
 LEAST_P = 1e-9
+EVIDENCE = 8.0  # least log-likelihood ratio from which an effect is there: Markov's inequality, of 27 candidates
+CHOSEN = {"periodic_banding": 5.0}  # nats: its frequency is that of the highest of some hundred lines of the capture
+FALSE_ALARMS, TAIL = 0.001, 0.1  # probability of one; share of the draws that tell how the scores of chance fall off
 LEADERS = 3  # candidates that are paired with all others
 
 
@@ -51,6 +55,7 @@ class Evidence:
     names: tuple[str, ...]
     groups: tuple[str, ...]
     candidates: int
+    limit: float = EVIDENCE  # log-likelihood ratio from which an effect is there
 
     @property
     def has_flats(self) -> bool:
@@ -109,7 +114,22 @@ def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) ->
     laws = [of.law(float(amplitude), evidence.null) for amplitude in amplitudes]
     scores = [evidence.score(law) for law in laws]
     i = int(np.argmax(scores))
-    return Judged(of, float(amplitudes[i]), scores[i], evidence.misfit(laws[i]))
+    score = scores[i] - CHOSEN.get(of.name, 0.0)
+    return Judged(of, float(amplitudes[i]), score, evidence.misfit(laws[i]))
+
+
+def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray) -> float:
+    """Score that hardly any capture with nothing missing exceeds, from the z [draw, statistic] of such draws, nats.
+
+    Laws that are estimated from few draws give more by chance than Markov's inequality allows. The best scores of the
+    draws fall off exponentially.
+    """
+    nothing = null.log_density(z)
+    laws = [of.law(float(amplitude), null) for of in prints for amplitude in GRID[::2]]
+    best = np.max([law.log_density(z) for law in laws], 0) - nothing
+    start = float(np.quantile(best, 1 - TAIL))
+    beyond = float(np.mean(best[best > start] - start)) if (best > start).any() else 0.0
+    return max(EVIDENCE, start + beyond * float(np.log(TAIL / FALSE_ALARMS)))
 
 
 def best_pairs(judged: list[Judged], evidence: Evidence, number: int) -> list[Pair]:

@@ -13,7 +13,17 @@ from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.nearest import nearest
-from hsnoise.criticism.ranking import Candidate, Evidence, Pair, best_pairs, closest, judge
+from hsnoise.criticism.ranking import (
+    EVIDENCE,
+    GRID,
+    Candidate,
+    Evidence,
+    Pair,
+    best_pairs,
+    closest,
+    judge,
+    limit_by_chance,
+)
 
 verdicts = importlib.import_module("hsnoise.criticism.diagnose")  # the package has a function of that name
 decide = verdicts._verdict
@@ -170,3 +180,16 @@ def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are()
     base = PRINTS[0].at(1.0).mean(0)[None]
     assert "left" not in [one.name for one in nearest(prints, ranking, z, base, ones)]
     assert nearest(prints, ranking, evidence().z, no_base, ones) == ()
+
+
+def test_the_limit_of_chance_is_exceeded_by_few_captures_without_an_effect():
+    """Laws estimated from few draws are too narrow, and their scores too high by chance: the limit rises with them."""
+    z = np.random.default_rng(11).standard_normal((4000, STATISTICS))
+    limits = {}
+    for deviation in (1.0, 0.6):
+        null = Gaussian(np.zeros(STATISTICS), deviation**2 * np.eye(STATISTICS))
+        limits[deviation] = limit_by_chance(PRINTS, null, z[:64])
+        nothing = null.log_density(z)
+        best = np.max([of.law(float(a), null).log_density(z) for of in PRINTS for a in GRID], 0) - nothing
+        assert np.mean(best > limits[deviation]) < 0.01
+    assert limits[1.0] == EVIDENCE and limits[0.6] > EVIDENCE

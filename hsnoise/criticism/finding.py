@@ -1,0 +1,117 @@
+"""What `diagnose` found, and how it is told."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise.criticism.ranking import Candidate
+from hsnoise.effects import EFFECTS
+
+MISFIT_LEFT = 3.5  # normal score of the worst group up to which nothing stands out
+WORST = 5
+LEGEND = (
+    "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
+    " is meant); z left: normal score of the worst group of statistics with it in the model (below 3.5 nothing stands"
+    " out); p: chance of such a score if nothing is missing"
+)
+NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
+NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
+SIDES = "whether {} arises before or behind the gain is a first guess: improve fits both and keeps the likelier"
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What remains: the worst group's normal score, and the statistics that are far off, with their z.
+
+    Beyond what the diagnosis names, or what comes nearest if that explains half of it; else beyond the model.
+    """
+
+    misfit: float
+    group: str
+    statistics: tuple[str, ...]
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether a group as a whole is off by more than chance; single statistics among hundreds may be."""
+        return self.misfit > MISFIT_LEFT
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `diagnose` found.
+
+    Attributes:
+        ranking: candidates, best first; two that explain the capture only together come before all others.
+        verdict: "nothing missing", "named", "ambiguous" or "unexplained".
+        best: the first candidate if the verdict is "named" or "ambiguous", else None.
+        names: those that the verdict names: two if it is "ambiguous", or if two effects are missing together.
+        advice: the capture that would decide, or what to look at next.
+        unexplained: what remains.
+        nearest: if none explains the capture, the effects that explain most statistics, best first; `improve` tries
+            them. Scores of the ranking mean little there.
+    """
+
+    ranking: tuple[Candidate, ...]
+    verdict: str
+    best: Candidate | None
+    names: tuple[str, ...]
+    advice: str
+    unexplained: Unexplained
+    nearest: tuple[Candidate, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a few words: "missing: row_noise and hot_pixels"."""
+        if not self.names:
+            return self.verdict
+        return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
+
+    @property
+    def named(self) -> tuple[Candidate, ...]:
+        """The candidates that the verdict names."""
+        return tuple(c for c in self.ranking if c.name in self.names)
+
+    def plot(self):
+        """A figure of the ranking: `hsnoise.plots.ranking`."""
+        from hsnoise import plots  # matplotlib is slow to import
+
+        return plots.ranking(self)
+
+    def __str__(self) -> str:
+        table = Table("effect", "score / nats", "p", "z left")
+        for c in self.ranking[:WORST]:
+            table.add_row(c.name, f"{c.score:.1f}", c.chance, f"{c.misfit:.1f}")
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(self.headline, highlight=False)
+        console.print(table)
+        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
+        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
+        after = [self.advice, others, *sides, self._next()]
+        for sentence in (LEGEND, *map(_described, self.named), *after):
+            if sentence:
+                console.print(f"- {sentence}", highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+    def _next(self) -> str:
+        if self.best is None:
+            return ""
+        of_users = type(self.best.effect) not in EFFECTS
+        return f"next: {NEXT_OWN if of_users else NEXT}hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
+
+
+def _described(candidate: Candidate) -> str:
+    """What an effect is, and the first estimate of its parameters."""
+    effect = candidate.effect
+    values = []
+    for field, spec in effect.specs().items():
+        value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
+        values.append(f"{field} {value}" if spec.unit == "1" else f"{field} {value} {spec.unit}")
+    values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
+    return f"{effect.name}: {effect.about()} First estimate: {', '.join(values)}."
