@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # its parts are imported when they are used
 
-
 HARDLY_VARIES = 0.25  # variance of z over draws
 
 
