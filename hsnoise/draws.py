@@ -146,8 +146,5 @@ def share_of_far(z: np.ndarray) -> np.ndarray:
 
 
 def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
-    """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`.
-
-    Half of that stays however many draws there are: of a rare event that no draw has, one is still no wonder.
-    """
-    return np.maximum((dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS), floor / 2)
+    """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`."""
+    return (dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS)

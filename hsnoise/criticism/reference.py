@@ -49,7 +49,7 @@ class Reference:
         others = (self.draws.sum(0) - self.draws) / (n - 1)
         squares = (self.draws**2).sum(0) - self.draws**2
         variance = np.maximum(squares - (n - 1) * others**2, 0) / (n - 2)
-        deviation = np.sqrt(floored_variance(variance, n - 2, self.floor))
+        deviation = _deviation(variance, n - 2, self.floor)
         return (self.draws - others) / (deviation * np.sqrt(1 + 1 / (n - 1)))
 
 
@@ -63,8 +63,15 @@ def reference(model: NoiseModel, like: FrameStack, draws: int, seed: int, tick=l
     drawn = in_threads(lambda i: measure(draw_capture(seed + i, model, like), model), range(draws), tick)
     values = np.stack([one.values for one in drawn])
     floor = np.median([one.error for one in drawn], axis=0) ** 2
-    variance = floored_variance(values.var(0, ddof=1), draws - 1, floor)
-    return Reference(drawn[0].names, drawn[0].groups, values, values.mean(0), np.sqrt(variance), floor)
+    deviation = _deviation(values.var(0, ddof=1), draws - 1, floor)
+    return Reference(drawn[0].names, drawn[0].groups, values, values.mean(0), deviation, floor)
+
+
+def _deviation(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
+    """Deviation of statistics. Half of the analytic variance stays however many draws there are: of a rare event that
+    no draw has, one in a capture is still no wonder.
+    """
+    return np.sqrt(np.maximum(floored_variance(variance, dof, floor), floor / 2))
 
 
 def misfits(z: np.ndarray, groups: tuple[str, ...]) -> dict[str, float]:
