@@ -55,8 +55,8 @@ def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
     centred = z - z.mean(0)
     sample = centred.T @ centred / n
     # Units of z are kept from vanishing: what hardly varies in the draws is not known to vary so little in captures.
-    hardly = np.diagonal(sample) < HARDLY_VARIES
-    sample[np.ix_(hardly, hardly)] = np.eye(hardly.sum())
+    variance = np.diagonal(sample)
+    sample = sample + np.diag(np.where(variance < HARDLY_VARIES, 1 - variance, 0.0))
     target = np.diag(np.diagonal(sample))
     distance = ((sample - target) ** 2).sum()
     squares = (centred**2).T @ (centred**2) / n - sample**2

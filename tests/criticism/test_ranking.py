@@ -11,7 +11,7 @@ import pytest
 from hsnoise import effects as fx
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
-from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.nearest import nearest
 from hsnoise.criticism.ranking import (
     EVIDENCE,
@@ -180,6 +180,15 @@ def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are()
     base = PRINTS[0].at(1.0).mean(0)[None]
     assert "left" not in [one.name for one in nearest(prints, ranking, z, base, ones)]
     assert nearest(prints, ranking, evidence().z, no_base, ones) == ()
+
+
+def test_rare_statistics_that_go_with_others_leave_a_law():
+    """Counts of rare pixels hardly vary, and do so together with what the same pixels do elsewhere."""
+    z = np.random.default_rng(12).standard_normal((64, STATISTICS))
+    z[:, :19] = 0.45 * z[:, 20:21]
+    law = shrunk(z, np.zeros((1, STATISTICS)))
+    assert np.linalg.eigvalsh(law.covariance).min() > 0
+    assert np.all(np.diagonal(law.covariance)[:19] >= 1)
 
 
 def test_the_limit_of_chance_is_exceeded_by_few_captures_without_an_effect():
