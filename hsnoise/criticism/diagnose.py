@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback, listed, seed_of, whole_number
-from hsnoise._threads import in_threads
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
@@ -37,7 +36,7 @@ from hsnoise.criticism.ranking import (
 )
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined, refined_pair, score_with_base
-from hsnoise.draws import check_effects, check_fits, draw_capture, part_of
+from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
@@ -125,13 +124,8 @@ def diagnose(
 
 def _limit(judged: list[Judged], draws: int, bench: Bench, evidence: Evidence) -> float:
     """Score that chance gives in hardly any capture like this one, from as many fresh draws of the model."""
-
-    def z(number: int) -> np.ndarray:
-        drawn = draw_capture(bench.seed + CHANCE_SEEDS + number, bench.model, bench.part)
-        return bench.base.z(measure(drawn, bench.model).values)
-
-    fresh = np.stack(in_threads(z, range(draws), bench.tick))
-    return limit_by_chance([one.of for one in judged], evidence.null, fresh)
+    fresh = reference(bench.model, bench.part, draws, bench.seed + CHANCE_SEEDS, bench.tick)
+    return limit_by_chance([one.of for one in judged], evidence.null, bench.base.z(fresh.draws))
 
 
 def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:

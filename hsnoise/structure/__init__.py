@@ -137,8 +137,7 @@ class _Capture:
 def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, str], Entry]:
     """Highest lines of the periodograms averaged over exposures."""
     out = {}
-    for group in dict.fromkeys(group for of in spectra for group in of):
-        mean = np.mean([of[group] for of in spectra if group in of], 0)
+    for group, mean in _averages(spectra).items():
         where = "row spectrum" if group == "row x frame" else group
         out[where, f"peak of the spectrum, {half}"] = Entry(_lines.peak(mean), 0.15)
     return out
@@ -146,11 +145,14 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
 
 def _shares(profiles: list[dict[str, np.ndarray]]) -> dict[tuple[str, str], Entry]:
     """How much one frequency has of the static rows and columns, averaged over exposures."""
-    out = {}
-    for group in dict.fromkeys(group for of in profiles for group in of):
-        mean = np.mean([of[group] for of in profiles if group in of], 0)
-        out[group, "strongest frequency"] = Entry(_lines.strongest_share(mean), 0.15)
-    return out
+    shares = {group: _lines.strongest_share(mean) for group, mean in _averages(profiles).items()}
+    return {(group, "strongest frequency"): Entry(share, 0.15) for group, share in shares.items()}
+
+
+def _averages(exposures: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Mean by group, over the exposures that have it: those of one frame have nothing static."""
+    groups = dict.fromkeys(group for of in exposures for group in of)
+    return {group: np.mean([of[group] for of in exposures if group in of], 0) for group in groups}
 
 
 def explained(names: Iterable[str]) -> tuple[str, ...]:
