@@ -47,6 +47,7 @@ OPTIONS = {
     "kind": "--kind",
     "flats": "--flats",
     "report": "--report",
+    "model": "--model",
 }
 
 MEANING = """\
@@ -299,7 +300,7 @@ def _model(name: str) -> NoiseModel:
     if name in CAMERAS:
         return CAMERAS[name]()
     if not Path(name).is_file():
-        raise ValueError(f"--model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
+        raise ValueError(f"model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
     return NoiseModel.load(name)
 
 
