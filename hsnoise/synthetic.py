@@ -28,7 +28,7 @@ from hsnoise.stack import FrameStack
 from hsnoise.statistics import coding_of, summarise, without_counts
 from hsnoise.structure import structure
 
-COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS = 36, 12, 4
+COVARIANCE_DRAWS, MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 36, 12, 4, 48
 MOST_SLOPES, MOST_ITERATIONS = 4, 20  # derivatives cost four times what means do, and change little near the end
 SLACK, MUCH_LESS = 0.02, 0.8  # of the cost: rare counts make it rough; a step for which old derivatives are good enough
 LEAST_DAMPING = 0.1  # of the information, once a step failed
@@ -223,7 +223,7 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     the model still lacks must not bend what it can describe.
     """
     measured, _ = problem.statistics(problem.part)
-    scale, equal, scattered = _weights(problem, problem.start, tick)
+    scale, equal = _weights(problem, problem.start, tick)
 
     def point(y: np.ndarray) -> _Point:
         drawn = _draws(problem, y, tick)
@@ -263,8 +263,12 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    sets = [(drawn - drawn.mean(0)) / scale for drawn in (here.drawn, scattered)]
-    return here.y, _as_scattered(covariance, gain, sets), length, iterations
+    # The search knows means to a third of their scatter, and scatter from where it began.
+    drawn = _draws(problem, here.y, tick, LAST_DRAWS)
+    uphill = gain @ ((measured - drawn.mean(0)) / scale) - problem.prior * (here.y - problem.start)
+    step = covariance @ uphill
+    y = here.y + step * problem.share_of(step)
+    return y, _as_scattered(covariance, gain, (drawn - drawn.mean(0)) / scale), length, iterations
 
 
 def _first(problem: Problem, point) -> _Point:
@@ -300,13 +304,12 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     )
 
 
-def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: list[np.ndarray]) -> np.ndarray:
+def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
     """`covariance` [number, number], widened if estimates from draws scatter more than weights without correlation say.
 
-    gain [number, statistic] leads from statistics to the score; z are sets of draws about their mean [draw, statistic].
+    gain [number, statistic] leads from statistics to the score; z are draws about their mean [draw, statistic].
     """
-    estimates = np.concatenate(z) @ (covariance @ gain).T
-    known = len(estimates) - len(z)
+    estimates, known = z @ (covariance @ gain).T, len(z) - 1
     ratio = (estimates**2).sum(0) / known / np.diagonal(covariance)
     # Few draws: what they say of one number is averaged with what they say of all.
     of_all = DRAWS_OF_ALL / (known + DRAWS_OF_ALL)
@@ -343,9 +346,8 @@ def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Deviation [statistic] and inverse correlation of statistics, noise of simulated means included; their draws."""
-    # Of other seeds than the means, which tell how far estimates scatter.
+def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation [statistic] and inverse correlation of statistics, noise of simulated means included."""
     drawn = in_threads(lambda i: problem.draw(y, MEAN_DRAWS + i), range(COVARIANCE_DRAWS), tick)
     values, floor, n = np.stack([v for v, _ in drawn]), np.median([e for _, e in drawn], axis=0), len(drawn)
     variance = floored_variance(values.var(0, ddof=1), n - 1, floor**2)
@@ -355,12 +357,12 @@ def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndar
     # Shrunk to its diagonal: fewer draws than statistics.
     share = max(SHRINKAGE, min(1.0, len(scale) / (n * 4)))
     whole = (1 - share) * correlation + (share + 0.02) * np.eye(len(scale))
-    return scale, np.linalg.inv(whole), values
+    return scale, np.linalg.inv(whole)
 
 
-def _draws(problem: Problem, y: np.ndarray, tick) -> np.ndarray:
+def _draws(problem: Problem, y: np.ndarray, tick, count: int = MEAN_DRAWS) -> np.ndarray:
     """Statistics of draws at y [draw, statistic]."""
-    return np.stack([v for v, _ in in_threads(lambda i: problem.draw(y, i), range(MEAN_DRAWS), tick)])
+    return np.stack([v for v, _ in in_threads(lambda i: problem.draw(y, i), range(count), tick)])
 
 
 def _slopes(problem: Problem, y: np.ndarray, steps: np.ndarray, drawn: np.ndarray, tick) -> np.ndarray:

@@ -10,6 +10,7 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
 from hsnoise.synthetic import (
+    LAST_DRAWS,
     MOST_ITERATIONS,
     SHORT_STEP,
     Problem,
@@ -29,14 +30,14 @@ def linear_fit(weight):
     return np.linalg.inv(SLOPES.T @ weight @ SLOPES), SLOPES.T @ weight
 
 
-def draws(covariance, n=12, seed=1):
-    z = np.random.default_rng(seed).multivariate_normal(np.zeros(STATISTICS), covariance, n)
+def draws(covariance, seed):
+    z = np.random.default_rng(seed).multivariate_normal(np.zeros(STATISTICS), covariance, LAST_DRAWS)
     return z - z.mean(0)
 
 
 def test_errors_of_right_weights_stay():
     covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean([_as_scattered(covariance, gain, [draws(np.eye(STATISTICS), seed=s)]) for s in range(40)], 0)
+    widened = np.mean([_as_scattered(covariance, gain, draws(np.eye(STATISTICS), s)) for s in range(40)], 0)
     assert np.sqrt(np.diagonal(widened) / np.diagonal(covariance)) == pytest.approx(1.0, abs=0.15)
 
 
@@ -44,9 +45,7 @@ def test_errors_of_weights_that_hide_a_correlation_are_widened():
     together = SLOPES[:, 0] / np.linalg.norm(SLOPES[:, 0])
     true = np.eye(STATISTICS) + 8.0 * np.outer(together, together)  # the first number's own direction scatters thrice
     covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean(
-        [_as_scattered(covariance, gain, [draws(true, 12, s), draws(true, 36, 99 + s)]) for s in range(40)], 0
-    )
+    widened = np.mean([_as_scattered(covariance, gain, draws(true, s)) for s in range(40)], 0)
     ratio = np.sqrt(np.diagonal(widened) / np.diagonal(covariance))
     assert 2.4 < ratio[0] < 3.2 and np.all(ratio >= 1.0)
 
