@@ -56,6 +56,9 @@ def _fit_arguments(commands: Any) -> None:
     fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
     fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
+    fit.add_argument(
+        "--model", help="model.json whose effects are fitted, those of a story, say (default: the paper's model)"
+    )
     _method_argument(fit)
     _capture_arguments(fit)
 

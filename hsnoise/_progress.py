@@ -10,11 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from hsnoise.fit import fit
+from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
 
-def fit_with_progress(stack: FrameStack, method: str) -> FitResult:
+def fit_with_progress(stack: FrameStack, method: str, model: NoiseModel | None = None) -> FitResult:
     """`hsnoise.fit` with a bar while frames are read."""
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -26,7 +27,7 @@ def fit_with_progress(stack: FrameStack, method: str) -> FitResult:
             if progress.finished:
                 progress.add_task("Fitting", total=None)
 
-        return fit(stack, method=method, progress=tick)
+        return fit(stack, model=model, method=method, progress=tick)
 
 
 @contextmanager

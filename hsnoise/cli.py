@@ -28,9 +28,9 @@ from hsnoise._types import cfa_tile
 from hsnoise.criticism import Story
 from hsnoise.draws import check_fits, part_of
 from hsnoise.effects import RowNoise
-from hsnoise.fit import FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.photometry import scale_to_photoelectrons
+from hsnoise.result import TITLES, FitResult
 from hsnoise.stack import FrameStack
 
 SAMPLE_SHAPE = (480, 640)
@@ -48,6 +48,7 @@ OPTIONS = {
     "flats": "--flats",
     "report": "--report",
     "model": "--model",
+    "params": "--model",
 }
 
 MEANING = """\
@@ -132,16 +133,16 @@ def _simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
 
 def _fit(args: argparse.Namespace) -> None:
     _check_folder(args.out)
-    stack = _load(args.paths, args)
+    model, stack = None if args.model is None else _model(args.model), _load(args.paths, args)
     stack.check()
+    if model is not None:
+        check_fits(model, stack, "model")
     console, out = Console(highlight=False), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
-    fit = fit_with_progress(stack, args.method)
+    fit = fit_with_progress(stack, args.method, model)
     console.print(table_of(fit))
-    console.print(
-        f"Fit by {'maximum likelihood' if fit.method == 'ml' else 'the line method'}: {fit.outcome}", markup=False
-    )
+    console.print(f"{TITLES[fit.method]}: {fit.outcome}", markup=False)
     for note in fit.notes:
         console.print(f"- {note}", style="yellow", markup=False)
     written = _write_results(fit, out, {"files": args.paths})

@@ -113,7 +113,7 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
     if isinstance(stack, Summary):
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
     stack = as_stack(stack, **keywords)
-    check_fits(model, stack)
+    check_fits(model, stack, "model")
     part = part_of(stack)
     check_effects(model, part)
     bare = model

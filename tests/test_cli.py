@@ -54,7 +54,19 @@ def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_pa
     assert "1.0: like the model's own samples" in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "loop").iterdir()] == ["comparison.png"]
     assert main(["compare", *arguments, "--model", "canon_5d3"]) == 2
-    assert "params" in capsys.readouterr().err
+    assert "--model: made for RGGB" in capsys.readouterr().err
+
+
+def test_fit_fits_the_effects_of_a_model(capture, tmp_path, capsys):
+    bare = hsnoise.NoiseModel.load(capture / "true.json").remove("row_gain")
+    bare.save(tmp_path / "bare.json")
+    arguments = [str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "fit")]
+    assert main(["fit", *arguments, "--model", str(tmp_path / "bare.json"), "--debug"]) == 0
+    said = capsys.readouterr().out
+    assert "Joint maximum likelihood: converged" in said and "row_gain.exponent" not in said
+    assert hsnoise.NoiseModel.load(tmp_path / "fit" / "model.json").names == bare.names
+    assert main(["fit", *arguments, "--model", "canon_5d3"]) == 2
+    assert "--model: made for RGGB" in capsys.readouterr().err
 
 
 def test_fit_writes_a_model_a_table_and_figures(fitted):
