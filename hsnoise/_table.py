@@ -6,6 +6,7 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from hsnoise._types import unit_in_words
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, rounded
 
@@ -22,7 +23,7 @@ def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
         table.add_column("truth", justify="right", no_wrap=True)
         table.add_column("off by", justify="right", no_wrap=True)
     for name, (value, error, unit) in fit.table.items():
-        cells = [name, *rounded(value, error), "" if unit == "1" else unit]
+        cells = [name, *rounded(value, error), unit_in_words(unit)]
         if name in true_values:
             true_value = true_values[name][0]
             known = error > 0 and np.isfinite(error)

@@ -23,6 +23,11 @@ BAYER_CFAS = ("RGGB", "BGGR", "GRBG", "GBRG")
 SHUTTERS = ("rolling", "global")
 
 
+def unit_in_words(unit: str) -> str:
+    """The unit as it stands behind a number: nothing for "1"."""
+    return "" if unit == "1" else unit
+
+
 def channels_of(cfa: str) -> tuple[str, ...]:
     """Names of the channels of a colour filter array: ("mono",) or ("R", "G", "B").
 

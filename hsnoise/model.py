@@ -24,7 +24,7 @@ from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
 from hsnoise._poisson import Regime, regime_of
-from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced
+from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
 from hsnoise.arrivals import merged
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
 from hsnoise.signal_chain import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
@@ -128,8 +128,7 @@ class NoiseModel(eqx.Module):
                 parameters = effect.parameters(self.channels)
             except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
                 return head
-            of = [(p, "" if p.spec.unit == "1" else f" {p.spec.unit}") for p in parameters]
-            lines += [f"  {p.name} = {p.value:.6g}{unit}" for p, unit in of]
+            lines += [f"  {p.name} = {p.value:.6g} {unit_in_words(p.spec.unit)}".rstrip() for p in parameters]
             chosen = effect.settings().items()
             lines += [f"  {effect.name}.{field} = {value}" for field, value in chosen if value is not None]
         return "\n".join(lines)

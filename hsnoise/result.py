@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise import rows
+from hsnoise._types import unit_in_words
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, binning, dark_laws, log_probability
 from hsnoise.statistics import Summary, without_counts
@@ -86,7 +87,7 @@ class FitResult:
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
         for name, (value, error, unit) in self.table.items():
-            table.add_row(name, *rounded(value, error), unit)
+            table.add_row(name, *rounded(value, error), unit_in_words(unit))
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(f"{title}: {darks}{flats}", highlight=False)
         console.print(table)

@@ -131,9 +131,9 @@ def test_a_page_stands_alone(pages, command):
     ("names", "misfit", "words"),
     [
         (("row_noise",), 1.2, "No group of statistics stands out with row_noise in the model. Single statistics"),
-        (("row_noise",), 7.2, "Still far off with row_noise in the model (the worst group, row x frame, has a"),
+        (("row_noise",), 7.2, "Still far off with row_noise in the model (the worst group, row x frame, by"),
         ((), 1.2, "No group of statistics stands out. Single statistics that are off by more than 3"),
-        ((), 7.2, "Far off (the worst group, row x frame, has a normal score of 7.2)"),
+        ((), 7.2, "Far off (the worst group, row x frame, by 7.2 deviations)"),
     ],
 )
 def test_what_is_left_is_called_so_only_if_it_stands_out(names, misfit, words, stack, compared):

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._types import unit_in_words
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
 
@@ -16,8 +17,8 @@ MISFIT_LEFT = 3.5  # normal score of the worst group up to which nothing stands 
 WORST = 5
 LEGEND = (
     "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
-    " is meant); z left: normal score of the worst group of statistics with it in the model (below 3.5 nothing stands"
-    " out); p: chance of such a score if nothing is missing"
+    " is meant); z left: how far off the worst group of statistics is with it in the model, in deviations of a normal"
+    " law (below 3.5 nothing stands out); p: chance of such a score if nothing is missing"
 )
 NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
 NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
@@ -112,6 +113,6 @@ def _described(candidate: Candidate) -> str:
     values = []
     for field, spec in effect.specs().items():
         value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
-        values.append(f"{field} {value}" if spec.unit == "1" else f"{field} {value} {spec.unit}")
+        values.append(f"{field} {value} {unit_in_words(spec.unit)}".rstrip())
     values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
     return f"{effect.name}: {effect.about()} First estimate: {', '.join(values)}."

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise._arguments import callback, counter, seed_of
+from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.ranking import Candidate
@@ -228,7 +229,7 @@ def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
     for label, (value, error, unit) in rows:
         size, of = rounded(value, error)
         of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
-        told.append(f"{label} = {size} {of}{'' if unit == '1' else f' {unit}'}")
+        told.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip())
     chosen = result.params[name].settings().items()
     told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
     return tuple(f"{sentence}." for sentence in told)
@@ -358,8 +359,8 @@ def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
     for name in before.names:
         (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
         if abs(new - old) > MOVED_SIGMA * max(error, new_error) > 0:
-            words = f"{name} moved from {old:.4g} to {new:.4g}"
-            moved.append(f"{words}." if unit == "1" else f"{words} {unit}.")
+            words = f"{name} moved from {rounded(old, error)[0]} to {rounded(new, new_error)[0]}"
+            moved.append(f"{words} {unit_in_words(unit)}".rstrip() + ".")
     return tuple(moved)
 
 

@@ -64,7 +64,7 @@ def page(
         fit = found.fit
     if not isinstance(fit, FitResult | NoiseModel):
         raise TypeError(f"fit: expected a FitResult or a NoiseModel, got {type(fit).__name__}")
-    return render(context(found, stack, fit, comparison, files), found, stack, fit, seed)
+    return render(context(found, stack, fit, comparison, files, seed), found, stack, fit, seed)
 
 
 def write_report(path: str | os.PathLike, found: Comparison | Diagnosis | Story, stack: FrameStack, **keywords) -> None:

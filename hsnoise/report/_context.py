@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import date
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
@@ -27,6 +30,7 @@ def context(
     fit: FitResult | NoiseModel,
     comparison: Comparison | None,
     files: Sequence[str],
+    seed: int,
 ) -> dict[str, Any]:
     """All that the template needs but figures."""
     diagnosis = found if isinstance(found, Diagnosis) else None
@@ -37,6 +41,7 @@ def context(
         comparison, diagnosis = story.steps[-1].comparison, story.steps[-1].diagnosis
     return {
         "title": TITLES[type(found)],
+        "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
         "verdict": verdict(found, comparison),
         "good": is_good(found) and (comparison is None or comparison.error < CLEAR),
         "capture": capture(stack, files),
@@ -115,15 +120,11 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     settings = [(e.name, n, v) for e in model.effects for n, v in e.settings().items() if v is not None]
     chosen = [{"name": f"{name}.{field}", "value": f"{value}", "unit": ""} for name, field, value in settings]
     if isinstance(fit, NoiseModel):
-        rows = [{"name": name, "value": f"{v:.5g}", "unit": _unit(unit)} for name, (v, unit) in fit.table().items()]
-        return [*rows, *chosen]
-    cells = [(name, *rounded(value, error), _unit(unit)) for name, (value, error, unit) in fit.table.items()]
+        cells = [(name, f"{value:.5g}", unit_in_words(unit)) for name, (value, unit) in fit.table().items()]
+        return [*(dict(zip(("name", "value", "unit"), row, strict=True)) for row in cells), *chosen]
+    cells = [(name, *rounded(value, error), unit_in_words(unit)) for name, (value, error, unit) in fit.table.items()]
     rows = [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in cells]
     return [*rows, *({**row, "error": "chosen"} for row in chosen)]
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
 
 
 def bars(comparison: Comparison) -> dict[str, Any]:
