@@ -9,7 +9,8 @@ import numpy as np
 from hsnoise.model import NoiseModel
 
 OFF_BOUNDS = 0.02  # share of the range between two bounds
-SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself
+SMALL = 0.01  # a number without bounds that starts below this is small in its unit: its steps are measured by itself,
+# unless it has no unit: an exponent that starts close to 0 may end at 1
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def knobs(model: NoiseModel, extra: tuple[str, ...]) -> list[Knob]:
             for place in [(i,) for i in range(len(model.channels))] if spec.per_channel else [()]:
                 label = next(labels)
                 value = float(np.asarray(getattr(effect, field))[place])
-                size = abs(value) if 0 < abs(value) < SMALL else 1.0
+                size = abs(value) if spec.unit != "1" and 0 < abs(value) < SMALL else 1.0
                 if not spec.holds(value):
                     found.append(Knob(label, name, field, place, spec.low, spec.high, size))
     return found

@@ -104,6 +104,14 @@ def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, lab
     assert knob.slope(x) == pytest.approx((knob.inverse(x + 1e-6) - knob.inverse(x - 1e-6)) / 2e-6, rel=1e-3)
 
 
+@pytest.mark.parametrize("start", [0.0, 0.004, 0.5])
+def test_an_exponent_moves_as_far_from_any_start(start):
+    model = hsnoise.cameras.canon_5d3().add(RowNoise(1.0, start))
+    (knob,) = [k for k in knobs(model, ("row_noise",)) if k.label == "row_noise.exponent"]
+    x = knob.read(model)
+    assert knob.inverse(x + 0.2) - knob.inverse(x) == pytest.approx(0.2)
+
+
 def test_what_an_effect_holds_is_no_knob():
     model = hsnoise.cameras.grasshopper3().add(fx.PeriodicBanding(1.0, 0.2))
     assert [k.label for k in knobs(model, ("periodic_banding",))] == ["periodic_banding.amplitude"]
