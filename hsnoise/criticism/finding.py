@@ -86,7 +86,7 @@ class Diagnosis:
     def __str__(self) -> str:
         table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
-            table.add_row(c.name, f"{c.score:.1f}", c.chance, f"{c.misfit:.1f}")
+            table.add_row(c.name, f"{c.score:z.1f}", c.chance, f"{c.misfit:z.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
         console.print(table)

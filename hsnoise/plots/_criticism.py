@@ -82,7 +82,7 @@ def story(found) -> Figure:
         found: result of `hsnoise.improve`.
     """
     names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
-    figure = new_figure(6.5, 0.5 * len(names) + 1.7, "Error of the model, step by step")
+    figure = new_figure(5.2, 0.5 * len(names) + 1.7, "Error of the model, step by step")
     axes = figure.subplots()
     y = np.arange(len(names))
     axes.plot(found.errors, y, "o-", color=BAR, markersize=8)

@@ -85,7 +85,7 @@ def _verdict_of_story(story: Story) -> str:
     if not added:
         return story.ended
     first, last = story.errors[0], story.errors[-1]
-    ended = story.ended[0].lower() + story.ended[1:]
+    ended = (story.ended[0].lower() + story.ended[1:]).replace(f" (error {last:.2f})", "")  # it is said already
     return f"Added {', '.join(added)}, and the error fell from {number(first)} to {number(last)}; {ended}"
 
 
@@ -139,7 +139,10 @@ def bars(comparison: Comparison) -> dict[str, Any]:
     def at(misfit: float) -> str:
         return f"{100 * max(np.log(max(misfit, LEAST_SHOWN) / LEAST_SHOWN) / span, 0.005):.2f}%"
 
-    shown = [{"name": g, "misfit": number(m), "width": at(m), "alarm": m > ALARM * own} for g, m in groups]
+    shown = [
+        {"name": g, "misfit": f"{m:.2f}" if m < 10 else number(m), "width": at(m), "alarm": m > ALARM * own}
+        for g, m in groups
+    ]
     return {"groups": shown, "one": at(1.0), "own": at(own), "own_misfit": number(own)}
 
 
@@ -148,9 +151,9 @@ def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return [
         {
             "name": c.name,
-            "score": f"{c.score:.1f}",
+            "score": f"{c.score:z.1f}",
             "p": c.chance,
-            "misfit": f"{c.misfit:.1f}",
+            "misfit": f"{c.misfit:z.1f}",
             "named": c.name in diagnosis.names,
         }
         for c in diagnosis.ranking[:MOST_CANDIDATES]
