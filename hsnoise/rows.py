@@ -19,6 +19,8 @@ from jax.scipy.special import log_ndtr, logsumexp
 ITERATIONS = 80
 WHOLE_STEPS = 20  # later ones are shortened, against going round in circles
 TOLERANCE = 1e-4  # the evidence is stationary at the fixed point: its error is the square of this, a row
+MIXED, NEAR = 2, 1.0  # steps that the next one is mixed from, and the change below which they may be
+RIDGE = 1e-6
 FAILED = 0.5  # a frame that still changes by more, in deviations of a row, has no evidence: NaN
 FARTHEST, FARTHEST_SIGMA = 0.1, 2.0  # that a row's gain moves in one step: so far and so many of its own deviations
 PRIOR_REACH = 7.5  # standard deviations of the row gain that the nodes cover
@@ -202,23 +204,54 @@ def _consistent(rows: Curves, spectrum):
     """
     ones = jnp.ones(rows.layout.place.shape, spectrum.dtype)
     start = (ones, ones[:, 0]), (ones, jnp.broadcast_to(spectrum.mean(), ones[:, 0].shape))
+    far = jnp.full_like(ones[:, 0], jnp.inf)
 
-    def iterate(rows: Curves, start, change):
+    def iterate(rows: Curves, spectrum, start, change):
         def step(state):
-            count, _, _, (mean, variance) = state
-            return count + 1, *_step(rows, spectrum, mean, variance, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
+            count, change, _, _, at, before = state
+            # The longer it takes, the shorter the steps.
+            found = _step(rows, spectrum, *at, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
+            ahead, before = _ahead(at, found[2], found[0], change, before)
+            return count + 1, *found, ahead, before
 
         def going(state):
             return (state[0] < ITERATIONS) & (state[1].max() > TOLERANCE)
 
-        return jax.lax.while_loop(going, step, (0, change, *start))[1:]
+        mean, variance = start[1]
+        nothing = jnp.zeros((MIXED, len(mean), mean.shape[1] + 1), mean.dtype)
+        history = nothing, nothing, jnp.full((MIXED, len(mean)), jnp.inf, mean.dtype)
+        return jax.lax.while_loop(going, step, (0, change, *start, start[1], history))[1:4]
 
     # In float32, several times as fast; where that fails, float64 goes all of the way.
-    far = jnp.full_like(start[0][1], jnp.inf)
-    near = iterate(rows.in_float32(), start, far)
+    narrow = partial(jax.tree.map, lambda x: x.astype(jnp.float32))
+    near = iterate(rows.in_float32(), narrow(spectrum), narrow(start), narrow(far))
     sound = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(near)]).all()
-    change, *state = jax.tree.map(partial(jnp.where, sound), near, (far, *start))
-    return iterate(rows, tuple(state), change)
+    change, *state = jax.tree.map(lambda x, y: jnp.where(sound, x.astype(y.dtype), y), near, (far, *start))
+    return iterate(rows, spectrum, tuple(state), change)
+
+
+def _ahead(at, cavity, change, change_before, before):
+    """Where the next step begins, and what later steps need to know of this one.
+
+    Anderson's mixing (J. ACM 12, 1965) of the last steps: the combination of them that leaves least to go, in half as
+    many steps. Frames that are far from the end, or came no nearer, just go on from their cavity.
+    """
+    (mean, variance), deviation = cavity, jnp.sqrt(cavity[1])[:, None]
+    told = jnp.concatenate([mean, jnp.log(variance)[:, None]], axis=1)
+    off_variance = jnp.log(variance / at[1])[:, None] * jnp.sqrt(mean.shape[1])
+    off = jnp.concatenate([(mean - at[0]) / deviation, off_variance], axis=1)
+    told_before, off_before, changes = before
+    useful = (changes < NEAR) & (change < change_before)[None, :]
+    d_told, d_off = (
+        jnp.where(useful[..., None], now[None] - then, 0.0) for now, then in ((told, told_before), (off, off_before))
+    )
+    square = jnp.einsum("ifn,jfn->fij", d_off, d_off)
+    ridge = RIDGE * jnp.trace(square, axis1=1, axis2=2) + jnp.finfo(mean.dtype).tiny
+    along = jnp.einsum("ifn,fn->fi", d_off, off)
+    share = jnp.linalg.solve(square + ridge[:, None, None] * jnp.eye(MIXED, dtype=mean.dtype)[None], along[..., None])
+    ahead = told - jnp.einsum("fi,ifn->fn", share[..., 0], d_told)
+    history = zip((told, off, change), before, strict=True)
+    return (ahead[:, :-1], jnp.exp(ahead[:, -1])), tuple(jnp.concatenate([new[None], old[:-1]]) for new, old in history)
 
 
 def _step(rows: Curves, spectrum, mean, variance, most):
