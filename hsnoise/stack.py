@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -152,7 +153,11 @@ class FrameStack:
         frame is read now, and checked: see `check_frame`.
         """
         counts = self.counts[exposure]
-        frame = read_mapped(counts, number) if isinstance(counts, np.memmap) else np.asarray(counts[number])
+        if isinstance(counts, np.memmap):
+            frame = read_mapped(counts, number)
+        else:
+            with _cluster_watched(frame_name(self, exposure, number)):
+                frame = np.asarray(counts[number])
         if self.is_lazy(exposure):
             check_frame(frame, self, exposure=exposure, frame_number=number)
         return in_sensor_orientation(frame, self.row_axis)
@@ -168,7 +173,7 @@ class FrameStack:
 
         Frames of a Dask array are read, checked and given to `function` where its scheduler runs tasks, such as the
         workers of a cluster, and only the results come back, those of some frames as one if `combine` adds them up. A
-        task whose worker is lost runs again elsewhere.
+        task whose worker is lost runs again elsewhere; RuntimeError if the whole cluster is.
         """
         counts = self.counts[exposure]
         if not is_dask(counts):
@@ -186,7 +191,9 @@ class FrameStack:
             while combine is not None and len(tasks) > 1:
                 pairs = zip(tasks[::2], tasks[1::2], strict=False)
                 tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
-            yield from dask.compute(*tasks)
+            with _cluster_watched(names[0]):
+                results = dask.compute(*tasks)
+            yield from results
 
     def with_counts(self, counts: Sequence[np.ndarray], window: Window | None) -> FrameStack:
         """Other `counts`, an array an exposure in sensor orientation, as if they had been taken as this stack was.
@@ -332,6 +339,20 @@ def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
     """Contiguous uint16, or int32 where the stored type is signed, floating or wider than 16 bits."""
     dtype = np.uint16 if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2 else np.int32
     return np.ascontiguousarray(frame.T if row_axis == 1 else frame, dtype)
+
+
+@contextmanager
+def _cluster_watched(name: str) -> Iterator[None]:
+    """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`."""
+    try:
+        yield
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] != "distributed":  # which is imported only by those who use it
+            raise
+        raise RuntimeError(
+            f"{name}: the cluster was lost that this frame, or some after it, was read on ({type(error).__name__});"
+            " start it again, and run this once more"
+        ) from error
 
 
 def is_dask(counts: Any) -> bool:

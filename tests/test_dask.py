@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -85,6 +87,41 @@ def test_worker_that_is_lost_changes_nothing(counts, cluster, tmp_path):
     killer.join()
     same(from_workers, summarise(hsnoise.FrameStack(counts, **CAPTURE)))
     assert lost[0] not in cluster.run(os.getpid).values()
+
+
+@pytest.mark.slow
+def test_cluster_that_goes_away_is_told(counts, tmp_path):
+    started = [sys.executable, "-m"]
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    address = tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen(
+        [*started, "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", address],
+        **options,
+    )
+    worker = subprocess.Popen(
+        [*started, "distributed.cli.dask_worker", "--scheduler-file", address, "--nthreads", "1", "--no-dashboard"],
+        **options,
+    )
+    try:
+        while not address.exists():
+            time.sleep(0.1)
+        with distributed.Client(scheduler_file=str(address), timeout=30) as client:
+            client.wait_for_workers(1)
+            lazy = da.from_array(counts, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, meta=counts[:0])
+            killer = threading.Thread(target=kill_once_read, args=([scheduler, worker], tmp_path))
+            killer.start()
+            with pytest.raises(RuntimeError, match=r"frame \d+ of .*exposure \d.*: the cluster was lost"):
+                hsnoise.fit(lazy, **CAPTURE)
+            killer.join()
+    finally:
+        scheduler.kill(), worker.kill()
+
+
+def kill_once_read(processes, folder):
+    while not any(path.name.isdigit() for path in folder.iterdir()):
+        time.sleep(0.02)
+    for process in processes:
+        process.kill()
 
 
 def test_fit_of_a_dask_array_is_that_in_memory(counts):
