@@ -43,6 +43,16 @@ WORDS = {
     " in band ": "bands: ranges of frequency over the rows or columns of a frame, from slow to fast",
     "row x frame": "row x frame, column x frame: means of rows or columns that are new in each frame",
     "static map": "static map: mean over the frames, what stays in place",
+    " / ": "a / b: logarithm of the ratio of their mean squares, 0 where independent noise of the pixels makes both",
+    "residual": "residual: a pixel of a frame less its row, its column and its mean over frames, in spreads of its row",
+    "correlation, same ": "correlation, same row (column): of two colours that share a row (column) of the sensor",
+    "coherence": "coherence: how much of a band of frequencies the colours have in common",
+    "strongest frequency": "strongest frequency: how much of the static rows (columns) is one sine",
+    "steps of ": "steps of n: how much the mean of n lines changes to the next n",
+    "parity": "parity: even against odd lines",
+    "kurtosis": "log kurtosis: weight of the tails, 0 for a normal law",
+    "energy of ": "energy of blocks: scatter of the means of blocks of pixels",
+    "roughness": "roughness: how much a histogram jumps from code to code",
 }
 
 # What flats tell whatever the light: neither its level, its flicker nor its shape.
