@@ -55,7 +55,9 @@ MEANING = """\
 One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
-errors do not say: whether the model is right. Look at the residuals in histograms.png, and run hsnoise compare."""
+errors do not say: whether the model is right. {}"""
+LOOK = dict.fromkeys(("ml", "line"), "Look at the residuals in histograms.png, and run hsnoise compare.")
+LOOK["synthetic"] = "Run hsnoise compare. Figures of the likelihood would lack the added effects, and are left out."
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -145,9 +147,9 @@ def _fit(args: argparse.Namespace) -> None:
     console.print(f"{TITLES[fit.method]}: {fit.outcome}", markup=False)
     for note in fit.notes:
         console.print(f"- {note}", style="yellow", markup=False)
-    written = _write_results(fit, out, {"files": args.paths})
+    written = _write_results(fit, out, {"files": args.paths}, figures=fit.method != "synthetic")
     console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
-    console.print(MEANING, markup=False)
+    console.print(MEANING.format(LOOK[fit.method]), markup=False)
 
 
 def _compare(args: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import subprocess
 import sys
@@ -73,6 +74,14 @@ def test_every_figure_can_be_drawn_and_names_its_axes(draw, options):
     bottom = [axes for axes in figure.axes if axes.get_subplotspec().is_last_row()]
     assert all(axes.get_xlabel() for axes in bottom)
     assert figure.axes[0].get_ylabel()
+
+
+@pytest.mark.parametrize("draw", [plots.histograms, plots.photon_transfer, plots.row_spectrum])
+def test_figures_name_the_effects_that_they_lack(draw):
+    fit = fitted()
+    more = dataclasses.replace(fit, params=fit.params.add(hsnoise.effects.RowNoise(1.0)))
+    assert "without" not in draw(fit).get_suptitle()
+    assert draw(more).get_suptitle().endswith("; model without row_noise")
 
 
 def test_histograms_show_all_pixels_and_the_expected_ones():
@@ -194,7 +203,7 @@ def test_flats_alone_have_a_photon_transfer():
     key = jax.random.key(2)
     lit = [hsnoise.sample(key, np.full((3, 32, 64), e), truth, exposure_s=0.1) for e in (20.0, 100.0, 500.0)]
     summary = summarise(hsnoise.FrameStack(lit, [0.1] * 3, kind="flat", black_level=100, shutter="global"))
-    fit = SimpleNamespace(summary=summary, physics=physics_of(truth))
+    fit = SimpleNamespace(summary=summary, physics=physics_of(truth), params=truth)
     axes, *others = plots.photon_transfer(fit).axes
     assert not others
     signal = axes.collections[-1].get_offsets()[:, 0]

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, seconds, tidy
+from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, seconds, tidy, title_of
 from hsnoise.statistics import RowHistograms
 
 MOST_BINS = 90  # that can be told apart in a panel
@@ -36,7 +36,7 @@ def histograms(fit) -> Figure:
     shown = np.unique(np.linspace(0, exposures - 1, min(exposures, MOST_EXPOSURES)).round().astype(int))
     columns = len(summary.histograms)
     width, height = max(4.3 * columns, 6.4), 3.1 * len(shown) + 0.5
-    figure = new_figure(width, height, "Counts of the dark frames: measured and fitted")
+    figure = new_figure(width, height, title_of("Counts of the dark frames: measured and fitted", fit))
     expected = fit.expected_histograms()
     grid = figure.subplots(2 * len(shown), columns, squeeze=False, gridspec_kw={"height_ratios": [3, 1] * len(shown)})
     for i, e in enumerate(shown):

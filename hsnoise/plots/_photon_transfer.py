@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from hsnoise.physics import ROUNDING_VARIANCE, Physics, black_level_at
 from hsnoise.plots._moments import beta_rule, count_moments
-from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy
+from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary
 
 CLIPPED_FRACTION = 1e-3
@@ -30,7 +30,7 @@ def photon_transfer(fit) -> Figure:
     """
     summary, physics = fit.summary, fit.physics
     panels = [draw for draw, there in ((_darks, summary.histograms), (_flats, summary.flats is not None)) if there]
-    figure = new_figure(6.4 * len(panels), 5.0, "Photon transfer: variance against mean of the counts")
+    figure = new_figure(6.4 * len(panels), 5.0, title_of("Photon transfer: variance against mean of the counts", fit))
     for axes, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         draw(axes, physics, summary)
         axes.set_xlabel("mean above black level / DN")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from hsnoise import rows
 from hsnoise.physics import Physics
 from hsnoise.plots._moments import beta_rule, count_moments
-from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, seconds, tidy
+from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, seconds, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3
@@ -39,7 +39,7 @@ def row_spectrum(fit) -> Figure:
         missing = "dark frames in the stack" if not summary.histograms else "row_gain in the model"
         raise ValueError(f"fit: a row spectrum needs {missing}, and there is none")
     channels = len(summary.histograms)
-    figure = new_figure(max(4.3 * channels, 6.4), 4.6, "Spectrum of the row gain")
+    figure = new_figure(max(4.3 * channels, 6.4), 4.6, title_of("Spectrum of the row gain", fit))
     panels = figure.subplots(1, channels, squeeze=False, sharey=True)[0]
     for c, (axes, histograms) in enumerate(zip(panels, summary.histograms, strict=True)):
         _panel(axes, physics, c, histograms, summary)

@@ -5,12 +5,21 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hsnoise.fit import WITH_LIKELIHOOD
+from hsnoise.result import FitResult
+
 # Okabe and Ito's palette: told apart with any colour vision; the markers tell channels apart without colour.
 COLOURS = {"R": "#D55E00", "G": "#009E73", "B": "#0072B2", "mono": "#404040"}
 MARKERS = {"R": "o", "G": "s", "B": "^", "mono": "o"}
 NAMES = {"R": "red", "G": "green", "B": "blue", "mono": "all pixels"}
 FIT = "black"
 DPI = 110
+
+
+def title_of(text: str, fit: FitResult) -> str:
+    """A title, with the effects of the fit that its likelihood, and so a figure made of it, does not hold."""
+    lacking = [name for name in fit.params.names if name not in WITH_LIKELIHOOD]
+    return f"{text}; model without {', '.join(lacking)}" if lacking else text
 
 
 def new_figure(width_in: float, height_in: float, title: str) -> Figure:
