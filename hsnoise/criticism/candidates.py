@@ -19,6 +19,7 @@ from hsnoise.stack import FrameStack
 from hsnoise.structure import Places, code_step, moving_line, places
 
 LEAST_ELECTRONS = 0.2
+LEVELS_OF_A_CURVE = 3  # a straight line goes through any two
 FROM_FRAME_TO_FRAME = ("image_lag", "dark_current_drift", "frame_offset", "black_shading")  # not told by one frame
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
 LINE_SEEDS = range(7000, 7006)  # of draws without lines of their own
@@ -73,6 +74,9 @@ def built_in(model: NoiseModel, part: FrameStack) -> dict[str, Maker]:
     scale = Scale.of(model, part)
     makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, part.shutter), **_of_signal(scale)}
     makers |= _dark_signal(scale) if scale.has_exposure else _bias_frames(scale)
+    darks = {t for t, kind in zip(part.exposure_s, part.kind, strict=True) if kind == "dark"}
+    if len(darks) + part.kind.count("flat") < LEVELS_OF_A_CURVE:
+        makers.pop("nonlinearity", None)
     if scale.frames < 2:
         makers = {n: m for n, m in makers.items() if n not in FROM_FRAME_TO_FRAME}
     return {name: maker for name, maker in makers.items() if name not in model}

@@ -55,7 +55,8 @@ WORDS = {
     "roughness": "roughness: how much a histogram jumps from code to code",
 }
 
-# What flats tell whatever the light: neither its level, its flicker nor its shape.
+# What flats tell whatever the light: neither its level, its flicker nor its shape, to which dust belongs.
+SHAPE_OF_LIGHT = ("map, ", "pixels of the map", "log kurtosis of the map")
 FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
 
 
@@ -77,7 +78,11 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     entries = _entries(stack, layout, black_level_dn)
     if "flat" in stack.kind:
         lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
-        entries |= {(f"flats, {group}", what): e for (group, what), e in lit.items() if group in FLAT_GROUPS}
+        entries |= {
+            (f"flats, {group}", what): e
+            for (group, what), e in lit.items()
+            if group in FLAT_GROUPS and not what.startswith(SHAPE_OF_LIGHT)
+        }
     return _ordered(entries, layout)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise.criticism.candidates import built_in
 from hsnoise.criticism.reference import measure
 from hsnoise.draws import draw_capture, light_of, part_of
 from hsnoise.stack import FrameStack
@@ -49,6 +50,21 @@ def test_light_is_that_of_the_flats(plain):
     light = light_of(CAMERA, plain, 3)
     assert light.mean() == pytest.approx(1500 * 0.9, rel=0.01)
     assert light[32, 48] == pytest.approx(1500, rel=0.02) and light[0, 0] == pytest.approx(1050, rel=0.04)
+
+
+def test_what_dust_does_to_the_light_is_no_noise(plain):
+    names = measure(plain, CAMERA).names
+    of_maps = [name for name in names if name.startswith("flats, static pixels")]
+    assert any("pixel / residual" in name for name in of_maps)
+    assert not [name for name in of_maps if "kurtosis" in name or "sigma" in name or "away" in name]
+    assert any(name.startswith("static pixels: log kurtosis") for name in names)
+
+
+def test_a_curve_is_no_candidate_where_two_levels_tell_of_a_line_only(plain):
+    whole = built_in(CAMERA, plain)
+    one_dark_one_flat = plain.select(exposures=[1, 3])
+    assert "nonlinearity" in whole
+    assert whole.keys() - built_in(CAMERA, one_dark_one_flat).keys() >= {"nonlinearity"}
 
 
 def test_draws_are_as_bright_as_the_capture(plain):
