@@ -32,6 +32,7 @@ HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
 LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
+NEEDED = 0.1  # share of the misfit of some group, at least, that comes back without an effect
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
 MOVED_SIGMA = 2.0
@@ -177,7 +178,12 @@ def improve(
             return Story(tuple(steps), _end(found, last.comparison), split)
         for candidate in nearest:
             step = work.with_one_more(steps, candidate)
-            if step is not None and _is_better(step, last) and _is_there(candidate.effect, step.fit):
+            if (
+                step is not None
+                and _is_better(step, last)
+                and _is_there(candidate.effect, step.fit)
+                and work.needs(candidate.name, step)
+            ):
                 steps.append(step)
                 break
         else:
@@ -199,6 +205,11 @@ class _Work:
         comparison = compare(result.params, self.fitted, seed=self.seed)
         unseen = float("nan") if self.held_out is None else _log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
+
+    def needs(self, name: str, step: Step) -> bool:
+        """Whether some group fits worse without the effect: if not, what helped was that the others were refitted."""
+        without = compare(step.fit.params.remove(name), self.fitted, seed=self.seed).groups
+        return any(without[g] - misfit > NEEDED * max(misfit, 1.0) for g, misfit in step.comparison.groups.items())
 
     def with_one_more(self, steps: list[Step], candidate: Candidate) -> Step | None:
         """The model with the candidate, on the side of the gain where it fits better; None if it cannot be fitted.
@@ -278,8 +289,8 @@ def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
 def _left_out(tried: list[str], found: Diagnosis, comparison: Comparison) -> str:
     names = " or ".join(tried)
     reason = (
-        f"Adding {names} was tried, but it came out compatible with zero, or held-out frames or statistics fit worse"
-        " with it: it was left out."
+        f"Adding {names} was tried, but it came out compatible with zero, changed nothing by itself, or held-out frames"
+        " or statistics fit worse with it: it was left out."
     )
     if comparison.error <= CHANCE_ERROR:
         return f"{reason} Without it the error is {comparison.error:.2f}, as chance gives."
