@@ -208,10 +208,10 @@ def _consistent(rows: Curves, spectrum):
 
     def iterate(rows: Curves, spectrum, start, change):
         def step(state):
-            count, change, _, _, at, before = state
+            count, change, _, _, (mean, variance), before = state
             # The longer it takes, the shorter the steps.
-            found = _step(rows, spectrum, *at, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
-            ahead, before = _ahead(at, found[2], found[0], change, before)
+            found = _step(rows, spectrum, mean, variance, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
+            ahead, before = _ahead((mean, variance), found[2], found[0], change, before)
             return count + 1, *found, ahead, before
 
         def going(state):

@@ -120,8 +120,8 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     settings = [(e.name, n, v) for e in model.effects for n, v in e.settings().items() if v is not None]
     chosen = [{"name": f"{name}.{field}", "value": f"{value}", "unit": ""} for name, field, value in settings]
     if isinstance(fit, NoiseModel):
-        cells = [(name, f"{value:.5g}", unit_in_words(unit)) for name, (value, unit) in fit.table().items()]
-        return [*(dict(zip(("name", "value", "unit"), row, strict=True)) for row in cells), *chosen]
+        found = [(name, f"{value:.5g}", unit_in_words(unit)) for name, (value, unit) in fit.table().items()]
+        return [*(dict(zip(("name", "value", "unit"), row, strict=True)) for row in found), *chosen]
     cells = [(name, *rounded(value, error), unit_in_words(unit)) for name, (value, error, unit) in fit.table.items()]
     rows = [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in cells]
     return [*rows, *({**row, "error": "chosen"} for row in chosen)]
