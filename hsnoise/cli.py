@@ -137,8 +137,6 @@ def _fit(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     model, stack = None if args.model is None else _model(args.model), _load(args.paths, args)
     stack.check()
-    if model is not None:
-        check_fits(model, stack, "model")
     console, out = Console(highlight=False), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)

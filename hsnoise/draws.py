@@ -14,6 +14,7 @@ from hsnoise._types import cfa_tile
 from hsnoise.effects import Stage
 from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 from hsnoise.stack import FrameStack
+from hsnoise.statistics import Summary
 from hsnoise.structure import check_size
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
@@ -55,7 +56,7 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     return part.with_counts(counts, window)
 
 
-def check_fits(model: NoiseModel, stack: FrameStack, name: str = "params") -> None:
+def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
     """Raise TypeError or ValueError, naming the argument, unless `model` can describe the sensor of `stack`."""
     if not isinstance(model, NoiseModel):
         raise TypeError(f"{name}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")

@@ -36,6 +36,11 @@ AT_EDGE = (
 WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
 
 
+def without_likelihood(model: NoiseModel) -> tuple[str, ...]:
+    """The effects of a model that only simulated statistics can fit."""
+    return tuple(name for name in model.names if name not in WITH_LIKELIHOOD)
+
+
 def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progress=None, **keywords) -> FitResult:
     """Estimate all parameters of the paper's noise model jointly.
 
@@ -64,15 +69,14 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     if model is not None and not isinstance(model, NoiseModel):
         raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
-    extra = () if model is None else tuple(name for name in model.names if name not in WITH_LIKELIHOOD)
+    extra = () if model is None else without_likelihood(model)
     if extra:
         return _with_effects(stack, model, extra, method, progress, keywords)
     with_row_gain = model is None or _check_model(model)
-    summary = stack if isinstance(stack, Summary) else _summary_of(as_stack(stack, **keywords), progress)
-    if model is not None and (model.cfa, model.shutter) != (summary.cfa, summary.shutter):
-        raise ValueError(
-            f"model: made for {model.cfa}, {model.shutter} shutter; the stack is {summary.cfa}, {summary.shutter}"
-        )
+    source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
+    if model is not None:
+        check_fits(model, source, "model")  # before the frames are read
+    summary = source if isinstance(source, Summary) else _summary_of(source, progress)
     with_clamp = model is not None and "black_clamp" in model
     if with_clamp:
         _check_clamp(summary, method)

@@ -212,6 +212,9 @@ class _Point:
         share = share_of_far(self.off)
         return share[:, None] * equal * share
 
+    def uphill(self, gain: np.ndarray, problem: Problem) -> np.ndarray:
+        return gain @ self.off - problem.prior * (self.y - problem.start)
+
     def cost(self, weight: np.ndarray, problem: Problem) -> float:
         return float(self.off @ weight @ self.off + problem.prior @ (self.y - problem.start) ** 2)
 
@@ -225,8 +228,8 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     measured, _ = problem.statistics(problem.part)
     scale, equal = _weights(problem, problem.start, tick)
 
-    def point(y: np.ndarray) -> _Point:
-        drawn = _draws(problem, y, tick)
+    def point(y: np.ndarray, count: int = MEAN_DRAWS) -> _Point:
+        drawn = _draws(problem, y, tick, count)
         return _Point(y, drawn, (measured - drawn.mean(0)) / scale)
 
     here, damping, taken, wanted, fresh, iterations = _first(problem, point), 0.0, 0, True, False, 0
@@ -242,7 +245,7 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
         covariance = np.linalg.inv(information)
         deviation = np.sqrt(np.diagonal(covariance))
         by = np.minimum(by, STEP_SIGMA * deviation)
-        uphill = gain @ here.off - problem.prior * (here.y - problem.start)
+        uphill = here.uphill(gain, problem)
         length = float(np.abs(covariance @ uphill / deviation).max())
         if not np.isfinite(length):
             raise RuntimeError(_not_finite(problem, here.y))
@@ -264,11 +267,10 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
     # The search knows means to a third of their scatter, and scatter from where it began.
-    drawn = _draws(problem, here.y, tick, LAST_DRAWS)
-    uphill = gain @ ((measured - drawn.mean(0)) / scale) - problem.prior * (here.y - problem.start)
-    step = covariance @ uphill
-    y = here.y + step * problem.share_of(step)
-    return y, _as_scattered(covariance, gain, (drawn - drawn.mean(0)) / scale), length, iterations
+    here = point(here.y, LAST_DRAWS)
+    step = covariance @ here.uphill(gain, problem)
+    scattered = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
+    return here.y + step * problem.share_of(step), scattered, length, iterations
 
 
 def _first(problem: Problem, point) -> _Point:
@@ -360,7 +362,7 @@ def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndar
     return scale, np.linalg.inv(whole)
 
 
-def _draws(problem: Problem, y: np.ndarray, tick, count: int = MEAN_DRAWS) -> np.ndarray:
+def _draws(problem: Problem, y: np.ndarray, tick, count: int) -> np.ndarray:
     """Statistics of draws at y [draw, statistic]."""
     return np.stack([v for v, _ in in_threads(lambda i: problem.draw(y, i), range(count), tick)])
 

@@ -103,10 +103,9 @@ def test_cluster_that_goes_away_is_told(counts, tmp_path):
         **options,
     )
     try:
-        while not address.exists():
-            time.sleep(0.1)
+        # It waits for the file of the scheduler.
         with distributed.Client(scheduler_file=str(address), timeout=30) as client:
-            client.wait_for_workers(1)
+            client.wait_for_workers(1, timeout=60)
             lazy = da.from_array(counts, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, meta=counts[:0])
             killer = threading.Thread(target=kill_once_read, args=([scheduler, worker], tmp_path))
             killer.start()

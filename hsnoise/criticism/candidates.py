@@ -44,6 +44,7 @@ class Scale:
     has_exposure: bool
     has_bias: bool
     exposures_differ: bool  # of the darks
+    levels: int  # of signal: exposures of the darks, and flats
     light: float  # most photoelectrons of a flat, e-
     line: tuple[str, float]
     places: Places
@@ -52,7 +53,8 @@ class Scale:
     @staticmethod
     def of(model: NoiseModel, part: FrameStack) -> Scale:
         darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
-        longest = float(max(part.exposure_s[i] for i in darks))
+        exposures_s = {float(part.exposure_s[i]) for i in darks}
+        longest = max(exposures_s)
         return Scale(
             read_noise=float(model["read_noise"].sigma),
             longest_s=max(longest, 1e-9),
@@ -60,8 +62,9 @@ class Scale:
             gain=np.asarray(model["gain"].value, float),
             frames=max(part.n_frames[i] for i in darks),
             has_exposure=longest > 0,
-            has_bias=min(float(part.exposure_s[i]) for i in darks) < SHORT_SHARE * longest,
-            exposures_differ=len({float(part.exposure_s[i]) for i in darks}) > 1,
+            has_bias=min(exposures_s) < SHORT_SHARE * longest,
+            exposures_differ=len(exposures_s) > 1,
+            levels=len(exposures_s) + part.n_exposures - len(darks),
             light=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
             line=moving_line(part, [draw_capture(s, model, part) for s in LINE_SEEDS], black_level_of(model)),
             places=places(part),
@@ -74,9 +77,6 @@ def built_in(model: NoiseModel, part: FrameStack) -> dict[str, Maker]:
     scale = Scale.of(model, part)
     makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, part.shutter), **_of_signal(scale)}
     makers |= _dark_signal(scale) if scale.has_exposure else _bias_frames(scale)
-    darks = {t for t, kind in zip(part.exposure_s, part.kind, strict=True) if kind == "dark"}
-    if len(darks) + part.kind.count("flat") < LEVELS_OF_A_CURVE:
-        makers.pop("nonlinearity", None)
     if scale.frames < 2:
         makers = {n: m for n, m in makers.items() if n not in FROM_FRAME_TO_FRAME}
     return {name: maker for name, maker in makers.items() if name not in model}
@@ -188,10 +188,9 @@ def _of_signal(s: Scale) -> dict[str, Maker]:
     electrons = max(s.rate * s.longest_s, s.light)
     if electrons <= LEAST_ELECTRONS:
         return {}
-    makers: dict[str, Maker] = {
-        "nonlinearity": lambda f, rng: fx.Nonlinearity(0.08 * f / (electrons + 2 * s.read_noise)),
-        "image_lag": lambda f, rng: fx.ImageLag(min(0.03 * f, 0.5)),
-    }
+    makers: dict[str, Maker] = {"image_lag": lambda f, rng: fx.ImageLag(min(0.03 * f, 0.5))}
+    if s.levels >= LEVELS_OF_A_CURVE:
+        makers["nonlinearity"] = lambda f, rng: fx.Nonlinearity(0.08 * f / (electrons + 2 * s.read_noise))
     if s.light > 0:
         noise = np.sqrt(s.light + s.read_noise**2) / s.light
         makers["photo_response_nonuniformity"] = lambda f, rng: fx.PhotoResponseNonuniformity(0.3 * f * noise)

@@ -11,7 +11,7 @@ from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
-from hsnoise.fit import WITH_LIKELIHOOD, fit
+from hsnoise.fit import fit, without_likelihood
 from hsnoise.result import FitResult
 
 CLAMP = BlackClamp.name
@@ -28,7 +28,7 @@ def clamp_by_likelihood(
     model = bench.model
     if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
         return None
-    if any(name not in WITH_LIKELIHOOD for name in model.names) or np.ptp(fitted.summary.exposure_s) == 0:
+    if without_likelihood(model) or np.ptp(fitted.summary.exposure_s) == 0:
         return None
     try:
         clamped = fit(fitted.summary, model=model.add(BlackClamp(0.0)))

@@ -19,7 +19,7 @@ from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.fit import WITH_LIKELIHOOD, fit
+from hsnoise.fit import WITH_LIKELIHOOD, fit, without_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, rounded
 from hsnoise.stack import FrameStack, as_stack
@@ -95,8 +95,7 @@ class Story:
     @property
     def start(self) -> str:
         """The first model in words: effects beyond the paper's by their names."""
-        beyond = [name for name in self.steps[0].fit.params.names if name not in WITH_LIKELIHOOD]
-        return " + ".join(["the paper's model", *beyond])
+        return " + ".join(["the paper's model", *without_likelihood(self.steps[0].fit.params)])
 
     @property
     def errors(self) -> tuple[float, ...]:

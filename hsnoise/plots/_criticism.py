@@ -14,6 +14,7 @@ MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]
 ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
 MOST_TICKS = 3  # to either side of 0
+MOST_DECADES = 4  # named below the errors of a story
 LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
@@ -92,6 +93,7 @@ def story(found) -> Figure:
     axes.set_xscale("log")
     low, high = min(0.5, 0.7 * min(found.errors)), max(2.0, *found.errors)
     axes.set_xlim(low, high * (high / low) ** 0.22)  # room for the last number
+    axes.xaxis.set_major_locator(LogLocator(numticks=MOST_DECADES))
     axes.xaxis.set_major_formatter(_plain)
     axes.set_ylim(len(names) - 0.5, -0.6)
     axes.set_yticks(y, names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.fit import WITH_LIKELIHOOD
+from hsnoise.fit import without_likelihood
 from hsnoise.result import FitResult
 
 # Okabe and Ito's palette: told apart with any colour vision; the markers tell channels apart without colour.
@@ -18,14 +18,14 @@ DPI = 110
 
 def title_of(text: str, fit: FitResult) -> str:
     """A title, with the effects of the fit that its likelihood, and so a figure made of it, does not hold."""
-    lacking = [name for name in fit.params.names if name not in WITH_LIKELIHOOD]
+    lacking = without_likelihood(fit.params)
     return f"{text}; model without {', '.join(lacking)}" if lacking else text
 
 
 def new_figure(width_in: float, height_in: float, title: str) -> Figure:
     """An empty figure whose parts make room for each other."""
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
-    figure.suptitle(title, fontsize=12)
+    figure.suptitle(title, fontsize=12, wrap=True)
     return figure
 
 
