@@ -100,7 +100,7 @@ def diagnose(
     if EVIDENCE < judged[0].score < SURE:
         evidence = replace(evidence, limit=_limit(judged, draws, bench, evidence))
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
-        judged = _looked_at(judged, len(judged), bench, evidence)
+        judged = _partners_looked_at(judged, bench, evidence)
         judged = _closer(judged, bench, evidence)
     judged = _on_its_side(judged, bench, evidence)
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
@@ -159,10 +159,22 @@ def _looked_at(judged: list[Judged], at_least: int, bench: Bench, evidence: Evid
         glanced = [one for one in judged[:at_least] if one.of.amplitudes == GLANCE]
         if not glanced:
             return judged
-        prints = bench.fingerprints({one.of.name: (one.of.maker, AMPLITUDES) for one in glanced}, DETAILS)
-        again = {of.name: judge(of, evidence) for of in prints}
-        judged = _best_first(again.get(one.of.name, one) for one in judged)
+        judged = _at_amplitudes(glanced, judged, bench, evidence)
         at_least = 1
+
+
+def _partners_looked_at(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
+    """Candidates, those that may be one of two effects judged by draws at several amplitudes; best first."""
+    likely = {name for pair in best_pairs(judged, evidence, MOST_LIKELY) for name in pair.names}
+    glanced = [one for one in judged if one.of.name in likely and one.of.amplitudes == GLANCE]
+    return _looked_at(_at_amplitudes(glanced, judged, bench, evidence), 1, bench, evidence)
+
+
+def _at_amplitudes(some: list[Judged], judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
+    """Candidates, some of them judged again by draws at several amplitudes; best first."""
+    prints = bench.fingerprints({one.of.name: (one.of.maker, AMPLITUDES) for one in some}, DETAILS)
+    again = {of.name: judge(of, evidence) for of in prints}
+    return _best_first(again.get(one.of.name, one) for one in judged)
 
 
 def _closer(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
