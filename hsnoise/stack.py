@@ -222,7 +222,7 @@ class FrameStack:
         *,
         rows: Any = None,
         columns: Any = None,
-        frames: slice | None = None,
+        frames: slice | Sequence[slice] | None = None,
         exposures: Sequence[int] | None = None,
     ) -> FrameStack:
         """Part of the stack; nothing is copied or read.
@@ -230,18 +230,22 @@ class FrameStack:
         Args:
             rows, columns: (start, stop) or slice of step 1, in sensor coordinates; None: all. Odd starts are
                 allowed: `cfa` is rotated so that it still names the first pixel.
-            frames: slice of the frames of every exposure.
+            frames: slice of the frames of every exposure, or a list of slices, one for each that is selected.
             exposures: indices of exposure groups.
 
         Raises:
-            ValueError: an empty or outside region, or one with an odd side on a Bayer sensor.
+            ValueError: an empty or outside region, or one with an odd side on a Bayer sensor; slices for another
+                number of exposures.
         """
         rows, columns = span("rows", rows, self.shape[0]), span("columns", columns, self.shape[1])
         groups = np.arange(self.n_exposures) if exposures is None else self._groups(exposures)
         region = (columns, rows) if self.row_axis == 1 else (rows, columns)
+        of_each = [frames] * len(groups) if frames is None or isinstance(frames, slice) else list(frames)
+        if len(of_each) != len(groups):
+            raise ValueError(f"frames: expected a slice for each of {len(groups)} exposures, got {len(of_each)}")
         cfa = shift_cfa(self.cfa, rows.start, columns.start)
         changes: dict[str, Any] = {
-            "counts": [crop(self.counts[i], *region, frames=frames) for i in groups],
+            "counts": [crop(self.counts[i], *region, frames=some) for i, some in zip(groups, of_each, strict=True)],
             "cfa": transpose_cfa(cfa) if self.row_axis == 1 else cfa,
             "exposure_s": self.exposure_s[groups],
             "kind": [self.kind[i] for i in groups],

@@ -48,6 +48,15 @@ def test_select_keeps_every_pixel_in_its_colour(cfa, row_axis, row, column, is_l
                 assert colour_of(part.cfa, i, j) == colour_of(whole.cfa, row + i, column + j)
 
 
+def test_select_takes_other_frames_of_each_exposure():
+    stack = FrameStack([dark_counts(n, 4, 6) for n in (5, 3, 2)], [1, 2, 3])
+    part = stack.select(frames=[slice(1, None), slice(2)], exposures=[2, 0])
+    assert part.n_frames == (1, 2)
+    np.testing.assert_array_equal(part.frame(1, 1), stack.frame(0, 1))
+    with pytest.raises(ValueError, match="frames: expected a slice for each of 3 exposures, got 2"):
+        stack.select(frames=[slice(1), slice(2)])
+
+
 def test_select_frames_and_exposures_keeps_what_is_known():
     counts = dark_counts(3, 4, 4, 6)
     stack = FrameStack(

@@ -15,8 +15,8 @@ from hsnoise._arguments import callback, counter, seed_of
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
+from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
-from hsnoise.criticism.reference import measure, reference
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import WITH_LIKELIHOOD, fit, without_likelihood
@@ -28,8 +28,6 @@ from hsnoise.synthetic import fit_synthetic
 CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 MOST_STEPS = 8
 MOST_TRIED = 4  # effects, where none explains all
-HELD_OUT_SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4
-LIKELIHOOD_DRAWS = 40
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
 LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
 NEEDED = 0.1  # share of the misfit of some group, at least, that comes back without an effect
@@ -121,8 +119,8 @@ class Story:
             if step.added:
                 before = self.steps[i - 1]
                 console.print(
-                    f"- Step {i}: added {step.added}, because {_because(before)}; error {before.comparison.error:.2f}"
-                    f" -> {step.comparison.error:.2f}.",
+                    f"- Step {i}: added {step.added}, because {_because(before, step.added)}; error"
+                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
                     highlight=False,
                 )
             for sentence in (*step.sizes, *step.moved):
@@ -133,6 +131,14 @@ class Story:
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+
+def together(before: Step, after: Step) -> str:
+    """What fell, in words, where an addition was kept although the error, that of the worst group, did not fall."""
+    if after.comparison.error <= before.comparison.error:
+        return ""
+    sums = [sum(step.comparison.groups.values()) for step in (before, after)]
+    return f", misfit of all groups together {sums[0]:.3g} -> {sums[1]:.3g}"
 
 
 def improve(
@@ -156,9 +162,9 @@ def improve(
     """
     say, keep, seed = callback("progress", progress), callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
-    fitted, held_out = _split(darks_of(stack), stack)
+    fitted, held_out = split_frames(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
-    work, split = _Work(fitted, held_out, seed, say), _told_of(fitted, held_out)
+    work, split = _Work(fitted, held_out, seed, say), told_of(fitted, held_out)
     say("Fitting the first model")
     steps: list[Step] = [work.step(fit(fitted, model=model), None, None)]
     while True:
@@ -202,7 +208,7 @@ class _Work:
     def step(self, result: FitResult, added: str | None, before: Step | None) -> Step:
         self.say("Comparing with the model's own samples")
         comparison = compare(result.params, self.fitted, seed=self.seed)
-        unseen = float("nan") if self.held_out is None else _log_likelihood(result.params, self.held_out, self.seed)
+        unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
 
     def needs(self, name: str, step: Step) -> bool:
@@ -226,9 +232,7 @@ class _Work:
         if not fits:
             return None
         best = (
-            fits[0]
-            if len(fits) == 1
-            else max(fits, key=lambda one: _log_likelihood(one.params, self.fitted, self.seed))
+            fits[0] if len(fits) == 1 else max(fits, key=lambda one: log_likelihood(one.params, self.fitted, self.seed))
         )
         return self.step(best, candidate.name, steps[-1])
 
@@ -336,34 +340,6 @@ def _fit_with(effect: AbstractEffect, steps: list[Step], fitted: FrameStack, tic
     return fit_synthetic(base, fitted, model, progress=tick)
 
 
-def _told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
-    """Which frames were fitted and which held out, in words."""
-    if held_out is None:
-        return ""
-    first, last = min(fitted.n_frames), min(held_out.n_frames)
-    return (
-        f"Fitted and compared were the first {first} dark frames of each exposure; held-out: the log-likelihood of the"
-        f" statistics of the other {last}, in nats (one more: 2.7 times as probable). To fit all of them:"
-        " hsnoise.fit(stack, model=story.params)."
-    )
-
-
-def _split(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
-    """The stack without the last frames of its darks, and those; all and None if there are too few to spare."""
-    fewest = min(darks.n_frames)
-    spared = max(LEAST_HELD_OUT, int(HELD_OUT_SHARE * fewest))
-    if fewest - spared < LEAST_FITTED or len(set(stack.kind)) > 1 or len(set(darks.n_frames)) > 1:
-        return stack, None
-    return stack.select(frames=slice(0, fewest - spared)), darks.select(frames=slice(fewest - spared, fewest))
-
-
-def _log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
-    own = reference(model, frames, LIKELIHOOD_DRAWS, seed + 5000)
-    values = measure(frames, model).values
-    return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
-
-
 def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
     moved = []
     for name in before.names:
@@ -385,12 +361,13 @@ def _end(found: Diagnosis, comparison: Comparison) -> str:
     return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
 
 
-def _because(step: Step) -> str:
+def _because(step: Step, added: str) -> str:
     found = step.diagnosis
+    score = next((one.score for one in found.ranking if one.name == added), None) if found else None
     if step.comparison.worst:
         reason = step.comparison.worst[0]
     else:
-        reason = f"its fingerprint is in the statistics (score {found.ranking[0].score:.0f} nats)" if found else ""
+        reason = "" if score is None else f"its fingerprint is in the statistics (score {score:.0f} nats)"
     if found is not None and found.verdict == "unexplained":
         return f"{reason} (no effect explains all of it; this one comes nearest)"
     return reason

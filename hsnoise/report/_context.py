@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
+from hsnoise.criticism.improve import together
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack
@@ -85,8 +86,9 @@ def _verdict_of_story(story: Story) -> str:
     if not added:
         return story.ended
     first, last = story.errors[0], story.errors[-1]
+    how = "fell" if last < first else "went"
     ended = (story.ended[0].lower() + story.ended[1:]).replace(f" (error {last:.2f})", "")  # it is said already
-    return f"Added {', '.join(added)}, and the error fell from {number(first)} to {number(last)}; {ended}"
+    return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}"
 
 
 def is_good(found: Comparison | Diagnosis | Story) -> bool:
@@ -167,9 +169,10 @@ def steps(story: Story) -> list[dict[str, Any]]:
             "added": after.added,
             "what": after.fit.params[after.added].about(),
             "sizes": after.sizes,
-            "why": _why(before),
+            "why": _why(before, after),
             "before": number(before.comparison.error),
             "after": number(after.comparison.error),
+            "together": together(before, after).replace("->", "\N{RIGHTWARDS ARROW}"),
             "held_out": _gain(before, after),
             "moved": after.moved,
         }
@@ -177,9 +180,10 @@ def steps(story: Story) -> list[dict[str, Any]]:
     ]
 
 
-def _why(before: Step) -> list[str]:
-    """Reasons to add the effect that the diagnosis named, the strongest statistics last."""
-    score = [] if before.diagnosis is None else [f"its log-likelihood ratio is {before.diagnosis.ranking[0].score:.0f}"]
+def _why(before: Step, after: Step) -> list[str]:
+    """Reasons to add the effect, the strongest statistics last."""
+    ranking = () if before.diagnosis is None else before.diagnosis.ranking
+    score = [f"its log-likelihood ratio is {one.score:.0f}" for one in ranking if one.name == after.added]
     return [*score, *before.comparison.worst[:2]]
 
 

@@ -16,7 +16,8 @@ from hsnoise import effects as fx
 from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.criticism.improve import Step, _is_better, _is_there, _is_too_little, _Work
+from hsnoise.criticism.held_out import split_frames
+from hsnoise.criticism.improve import Step, _is_better, _is_there, _is_too_little, _Work, together
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -302,3 +303,34 @@ def test_an_addition_is_judged_by_all_groups(groups, held_out, better):
         return Step(SimpleNamespace(params=MODEL), comparison, None, None, held_out, ())
 
     assert _is_better(step(groups, held_out), step({"frames": 35.0, "columns": 20.0}, 0.0)) is better
+
+
+@pytest.mark.parametrize(
+    ("frames", "fitted", "held_out"),
+    [((8, 8), (6, 6), (2, 2)), ((16, 6), (12, 4), (4, 2)), ((8, 5), (8, 5), None)],
+)
+@pytest.mark.parametrize("flats", [0, 3])
+def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_out, flats):
+    counts = [np.random.default_rng(i).integers(90, 110, (n, 32, 32), np.uint16) for i, n in enumerate(frames)]
+    kinds, lit = ["dark"] * 2, np.random.default_rng(9).integers(500, 600, (3, 32, 32), np.uint16)
+    if flats:  # between the darks
+        counts, kinds = [counts[0], lit, counts[1]], ["dark", "flat", "dark"]
+    stack = hsnoise.FrameStack(counts, np.arange(len(counts)), kind=kinds, shutter="global")
+    kept, unseen = split_frames(darks_of(stack), stack)
+    numbers = (fitted[0], 3, fitted[1]) if flats else fitted
+    assert kept.n_frames == numbers and kept.kind == stack.kind
+    assert (unseen is None) if held_out is None else (unseen.n_frames == held_out)
+    if unseen is not None:
+        np.testing.assert_array_equal(unseen.frame(1, 0), stack.frame(len(counts) - 1, fitted[1]))
+
+
+@pytest.mark.parametrize(
+    ("groups", "told"),
+    [((10.0, 14.0), ""), ((1.0, 16.0), ", misfit of all groups together 25 -> 17")],
+)
+def test_what_fell_is_told_where_the_error_did_not(groups, told):
+    def step(*groups):
+        comparison = SimpleNamespace(error=max(groups), groups=dict(enumerate(groups)))
+        return Step(None, comparison, None, None, 0.0, ())
+
+    assert together(step(10.0, 15.0), step(*groups)) == told

@@ -1,0 +1,48 @@
+"""Frames that no fit of `improve` has seen: the guard against over-fitting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hsnoise.criticism.reference import measure, reference
+from hsnoise.model import NoiseModel
+from hsnoise.stack import FrameStack
+
+SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
+DRAWS, SEEDS = 40, 5000  # of the likelihood; where its seeds begin, beyond those of fits
+
+
+def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
+    """The stack without the last frames of its darks, and those; all and None if there are too few to spare."""
+    spared = [max(LEAST_HELD_OUT, int(SHARE * n)) for n in darks.n_frames]
+    kept = [n - some for n, some in zip(darks.n_frames, spared, strict=True)]
+    if min(kept) < LEAST_FITTED:
+        return stack, None
+    of_darks = iter(kept)
+    frames = [slice(next(of_darks)) if kind == "dark" else slice(None) for kind in stack.kind]
+    return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
+
+
+def told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
+    """Which frames were fitted and which held out, in words."""
+    if held_out is None:
+        return ""
+    kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
+    return (
+        f"Fitted and compared were the first {_span(kept)} dark frames of each exposure; held-out: the log-likelihood"
+        f" of the statistics of the other {_span(held_out.n_frames)}, in nats (one more: 2.7 times as probable). To fit"
+        " all of them: hsnoise.fit(stack, model=story.params)."
+    )
+
+
+def log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
+    own = reference(model, frames, DRAWS, seed + SEEDS)
+    values = measure(frames, model).values
+    return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
+
+
+def _span(numbers: Sequence[int]) -> str:
+    return f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"
