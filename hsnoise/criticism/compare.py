@@ -21,6 +21,7 @@ from hsnoise.structure import explained
 DRAWS = 40
 WORST = 5  # statistics told in words
 NOTABLE_Z = 4.0
+NOTABLE_GAIN = 1.0  # in z, of a statistic that came nearer
 
 
 @dataclass(frozen=True)
@@ -126,10 +127,25 @@ def _left_out(stack: FrameStack, part: FrameStack) -> tuple[str, ...]:
 def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
     order = np.argsort(-np.abs(z))[:WORST]
     return tuple(
-        f"{names[i]}: measured {measured[i]:.3g}, the model gives {model[i]:.3g}"
-        f" ({abs(z[i]):.0f} standard deviations {'above' if z[i] > 0 else 'below'})"
+        f"{names[i]}: measured {measured[i]:.3g}, the model gives {model[i]:.3g} ({_deviations(z[i])})"
         for i in order
         if abs(z[i]) > NOTABLE_Z
+    )
+
+
+def _deviations(z: float) -> str:
+    return f"{abs(z):.0f} standard deviations {'above' if z > 0 else 'below'}"
+
+
+def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
+    """The statistics that another model describes better, in words, those first that came nearest in deviations."""
+    now = {name: (model, z) for name, _, _, model, z in after.table}
+    gains = [(abs(row[4]) - abs(now[row[0]][1]), row) for row in before.table if row[0] in now]
+    gains.sort(key=lambda gain: -gain[0])
+    return tuple(
+        f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with it {now[name][0]:.3g}"
+        for gain, (name, _, measured, model, z) in gains[:WORST]
+        if gain > NOTABLE_GAIN
     )
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hsnoise._arguments import callback, counter, seed_of
 from hsnoise._types import unit_in_words
-from hsnoise.criticism.compare import Comparison, compare
+from hsnoise.criticism.compare import Comparison, compare, nearer
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
@@ -119,7 +119,7 @@ class Story:
             if step.added:
                 before = self.steps[i - 1]
                 console.print(
-                    f"- Step {i}: added {step.added}, because {_because(before, step.added)}; error"
+                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
                     f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
                     highlight=False,
                 )
@@ -361,13 +361,13 @@ def _end(found: Diagnosis, comparison: Comparison) -> str:
     return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
 
 
-def _because(step: Step, added: str) -> str:
-    found = step.diagnosis
-    score = next((one.score for one in found.ranking if one.name == added), None) if found else None
-    if step.comparison.worst:
-        reason = step.comparison.worst[0]
+def _because(before: Step, after: Step) -> str:
+    found, reasons = before.diagnosis, nearer(before.comparison, after.comparison)
+    if reasons:
+        reason = reasons[0]
     else:
-        reason = "" if score is None else f"its fingerprint is in the statistics (score {score:.0f} nats)"
+        score = next((one.score for one in found.ranking if one.name == after.added), 0.0) if found else 0.0
+        reason = f"its fingerprint is in the statistics (score {score:.0f} nats)"
     if found is not None and found.verdict == "unexplained":
-        return f"{reason} (no effect explains all of it; this one comes nearest)"
+        return f"{reason} (no effect explains all that is off; this one comes nearest)"
     return reason

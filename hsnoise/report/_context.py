@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
+from hsnoise.criticism.compare import nearer
 from hsnoise.criticism.improve import together
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
@@ -181,10 +182,10 @@ def steps(story: Story) -> list[dict[str, Any]]:
 
 
 def _why(before: Step, after: Step) -> list[str]:
-    """Reasons to add the effect, the strongest statistics last."""
+    """Reasons to add the effect, the strongest statistics first."""
     ranking = () if before.diagnosis is None else before.diagnosis.ranking
     score = [f"its log-likelihood ratio is {one.score:.0f}" for one in ranking if one.name == after.added]
-    return [*score, *before.comparison.worst[:2]]
+    return [*nearer(before.comparison, after.comparison)[:2], *score]
 
 
 def _gain(before: Step, after: Step) -> str:

@@ -15,6 +15,7 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.cli import _simulated
 from hsnoise.criticism import candidates as library
+from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
 from hsnoise.criticism.improve import Step, _is_better, _is_there, _is_too_little, _Work, together
@@ -334,3 +335,14 @@ def test_what_fell_is_told_where_the_error_did_not(groups, told):
         return Step(None, comparison, None, None, 0.0, ())
 
     assert together(step(10.0, 15.0), step(*groups)) == told
+
+
+def test_an_addition_is_explained_by_what_it_brought_nearer():
+    def found(*rows):
+        table = tuple((name, "tails", 3.0, model, z) for name, model, z in rows)
+        return Comparison(1.0, {}, table, (), 1.0, 0.0, ())
+
+    before = found(("worst", 1.0, 90.0), ("its own", 2.0, -30.0), ("as before", 2.5, 5.0))
+    after = found(("worst", 1.1, 89.5), ("its own", 2.9, -1.0), ("as before", 2.5, 5.2))
+    (words,) = nearer(before, after)
+    assert words == "its own: measured 3, the model gave 2 (30 standard deviations below), with it 2.9"
