@@ -67,7 +67,12 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
     _, _, whiten = _curvature(coordinates, pilot.vector, pilot.whiten / np.sqrt(thinning), guide)
     vector, _, _, steps = _chords(pilot.vector, whiten, guide)
-    information = _in_parameters(coordinates, vector, whiten, guide) * scale
+
+    def anew(point):
+        parts = _pieces(_parameters(coordinates, point)[0], few, frames)
+        return _gradients_of_pieces(coordinates, [*parts[0], *parts[1]], 1 / scale, point[None])
+
+    information = _in_parameters(coordinates, vector, whiten, anew) * scale
     whole = partial(_gradients_of_pieces, coordinates, [*darks, *flats], 1.0)
     whiten = whiten / np.sqrt(scale)
     vector, value, distance, more = _chords(vector, whiten, whole)
@@ -103,7 +108,12 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
         vector = ahead
         if distance < CLOSE_SIGMA:
             break
-    information = _in_parameters(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
+
+    def anew(point):
+        own = replan(rules, plan_rules(_parameters(coordinates, point)[0], summary))
+        return _gradients(coordinates, light, _on_device(own), point[None])
+
+    information = _in_parameters(coordinates, vector, whiten, anew)
     return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
 
 
@@ -291,11 +301,12 @@ def replan(old: Rules, new: Rules) -> Rules:
     return tuple(enough(o, n) for o, n in zip(old, new, strict=True))
 
 
-def _in_parameters(coordinates, vector, whiten, gradients_at) -> np.ndarray:
+def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     """Information on the parameters themselves, from the whitening of the coordinates.
 
     A parameter at its bound of zero (no dark current, no row gain) has a coordinate far out where nothing changes; its
-    row is measured between two positive values within what the data resolve.
+    row is measured between two positive values within what the data resolve. `gradient_anew` plans the rules for a
+    point: the nodes for rows without gain all lie at 1.
     """
     slope = np.asarray(_parameters(coordinates, vector)[2])
     active = ~_idle(coordinates, vector)
@@ -303,14 +314,13 @@ def _in_parameters(coordinates, vector, whiten, gradients_at) -> np.ndarray:
     information = np.zeros((len(vector), len(vector)))
     information[np.ix_(active, active)] = inverse.T @ inverse
     at_bound = [i for i in coordinates.bounded if vector[i] < 0]
-    points = np.repeat(np.asarray(vector)[None], len(vector) + 1, axis=0)
     for i in at_bound:
-        ends = points.copy()
-        ends[:2, i] = (0.0, 1.5)
-        _, gradients = gradients_at(ends)
-        at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends[:2])
+        ends = np.repeat(np.asarray(vector)[None], 2, axis=0)
+        ends[:, i] = (0.0, 1.5)
+        gradients = [gradient_anew(end)[1][0] for end in ends]
+        at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends)
         values, slopes = zip(*(map(np.asarray, at_end[1:3]) for at_end in at_ends), strict=True)
-        low, high = (np.asarray(g) / s for g, s in zip(gradients[:2], slopes, strict=True))
+        low, high = (np.asarray(g) / s for g, s in zip(gradients, slopes, strict=True))
         row = -(high - low) / (values[1][i] - values[0][i])
         alone = np.where(np.arange(len(row)) == i, row, 0.0)
         coupled = np.where(np.isin(np.arange(len(row)), at_bound), alone, row)

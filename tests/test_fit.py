@@ -127,6 +127,19 @@ def test_model_without_row_gain_is_fitted_without():
     assert "row_gain.sigma.R" not in result.table and "row_gain" not in result.params
 
 
+@pytest.mark.parametrize("seed", [100, 102, 103])
+def test_a_camera_without_row_gain_has_a_bound_for_it(seed):
+    rng = np.random.default_rng(seed)
+    exposure_s = (0.01, 0.1, 0.5, 2.0)
+    signals = [rng.poisson(20 * t, (4, 96, 128)) + rng.normal(0, 4, (4, 96, 128)) for t in exposure_s]
+    counts = [np.rint(64 + 0.5 * signal).astype(np.uint16) for signal in signals]
+    result = hsnoise.fit(hsnoise.FrameStack(counts, exposure_s, black_level=64, shutter="global"))
+    value, error, _ = result.table["row_gain.sigma"]
+    # A row of 128 pixels of 40 + 16 e-^2 tells its gain to 4 %, 384 such rows the spread of gains to about 1 %.
+    assert value < 4 * error and 0.001 < error < 0.02
+    assert any("row_gain.sigma is compatible with zero" in note for note in result.notes)
+
+
 def assert_gain_not_determined(model, exposure_s, black_level, seed):
     result = hsnoise.fit(capture(model, seed=seed, exposure_s=(exposure_s,), black_level=black_level))
     assert result.outcome.startswith("converged")
