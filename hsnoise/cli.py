@@ -49,6 +49,7 @@ OPTIONS = {
     "report": "--report",
     "model": "--model",
     "params": "--model",
+    "seed": "--seed",
 }
 
 MEANING = """\
@@ -56,8 +57,8 @@ One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` ele
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
 errors do not say: whether the model is right. {}"""
-LOOK = dict.fromkeys(("ml", "line"), "Look at the residuals in histograms.png, and run hsnoise compare.")
-LOOK["synthetic"] = "Run hsnoise compare. Figures of the likelihood would lack the added effects, and are left out."
+LOOK = dict.fromkeys(("ml", "line"), "Look at the residuals in histograms.png, and run {}.")
+LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -115,7 +116,8 @@ def _demo(args: argparse.Namespace) -> None:
     story = _improve_with_progress(stack, DEMO_SEED, args.out, source)
     _tell(story, args.out, source, truth)
     if truth is not None:
-        print("off by: (value - truth) / standard error; beyond 3 only by rare chance.")
+        print("off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read")
+        print("noise are off together: their ratios are known better than themselves.")
         print(f"Hidden in these frames was {DEMO_HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
     print(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
@@ -147,7 +149,8 @@ def _fit(args: argparse.Namespace) -> None:
         console.print(f"- {note}", style="yellow", markup=False)
     written = _write_results(fit, out, {"files": args.paths}, figures=fit.method != "synthetic")
     console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
-    console.print(MEANING.format(LOOK[fit.method]), markup=False)
+    compare = f"hsnoise compare {args.paths[0]}{' ...' if args.paths[1:] else ''} --model {out / 'model.json'}"
+    console.print(MEANING.format(LOOK[fit.method].format(compare)), markup=False)
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -218,16 +221,14 @@ def _sample(args: argparse.Namespace) -> None:
         raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
     model = _model(args.model)
     exposures_s = args.exposure or [model.exposure_s]
-    clean = (
-        np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
-        if args.clean is None
-        else _clean(args.clean, args.mean_e, model)
-    )
+    dark = np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
+    clean = dark if args.clean is None else _clean(args.clean, args.mean_e, model)
     counts = _draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = _metadata(model, exposures_s, "flat" if args.clean else "dark")
     write_atomically(args.out, frames_file(suffix, counts, metadata))
     n, frames, rows, columns = counts.shape
-    print(f"{args.out}: {n * frames} frames of {rows} x {columns} pixels, counts {counts.min()} to {counts.max()} DN")
+    exposed, codes = " and ".join(f"{t:g} s" for t in exposures_s), f"counts {counts.min()} to {counts.max()} DN"
+    print(f"{args.out}: {n * frames} frames of {rows} x {columns} pixels, exposed {exposed}, {codes}")
 
 
 # Work
@@ -368,12 +369,13 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
         **source,
         "method": fit.method,
         "outcome": fit.outcome,
-        "standard_errors": {name: error for name, (_, error, _) in fit.table.items() if np.isfinite(error)},
+        "standard_errors": {name: error for name, (_, error, _) in fit.table.items() if 0 < error < np.inf},
     }
     fit.params.save(out / "model.json", provenance=provenance)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["parameter", "value", "standard_error", "unit"])
+    # 0: held, not fitted; inf: not determined.
     writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.table.items())
     write_atomically(out / "table.csv", text.getvalue().encode())
     drawings = {"photon_transfer.png": plots.photon_transfer} if figures else {}

@@ -18,7 +18,7 @@ from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
 from hsnoise.physics import Physics, physics_of
 from hsnoise.profile import profile_errors
-from hsnoise.result import FitResult
+from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
@@ -27,7 +27,6 @@ OUTLIERS_FROM = 1e-4
 SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
-NOT_CONVERGED = "NOT CONVERGED: "
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
     "{} lies at a step of the likelihood, where the rows whose gain the model clips at 0 are rounded to the next count:"

@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise._arguments import check_key, checked_exposure, checked_light, whole_number
+from hsnoise._arguments import check_key, checked_exposure, checked_light, listed, whole_number
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
@@ -184,7 +184,8 @@ class NoiseModel(eqx.Module):
                 f"{path}: file format {content.get('format_version')}, written by hsnoise "
                 f"{content.get('hsnoise_version')}; this version reads format {FORMAT_VERSION}."
             )
-        classes = {cls.name: cls for cls in (*EFFECTS, *effects)}
+        own = listed("effects", effects, "a list of classes of effects")
+        classes = {cls.name: cls for cls in (*EFFECTS, *own)}
         try:
             with jax.enable_x64(content["precision"] == "float64"):
                 channels = channels_of(content["cfa"])

@@ -20,9 +20,13 @@ DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 
 def closing_notes(result: FitResult) -> tuple[str, ...]:
     """All sentences that belong under the table of `result`."""
-    notes = [n for name, row in result.table.items() if (n := _note(name, row, result))]
     misfit = _misfit_notes(result) if result.summary.histograms else _flat_notes(result)
-    return (*notes, *misfit, *_order_note(result), *_light_note(result))
+    return (*parameter_notes(result), *misfit, *_order_note(result), *_light_note(result))
+
+
+def parameter_notes(result: FitResult) -> list[str]:
+    """What the capture does not determine of the paper's effects."""
+    return [note for name, row in result.table.items() if (note := _note(name, row, result))]
 
 
 def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:

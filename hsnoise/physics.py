@@ -22,6 +22,7 @@ from hsnoise.statistics import FlatMoments, Summary
 # Added to the probability of each bin: bounds the influence of a pixel that the model excludes (a cosmic hit), and
 # the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.
 FLOOR = 1e-10
+LEAST_ROW_SIGMA = 1e-6  # the integral over the gains of rows that have none
 ROUNDING_VARIANCE = 1 / 12  # of rounding to whole counts, DN^2
 
 
@@ -86,7 +87,7 @@ def physics_of(model: NoiseModel) -> Physics:
         gain=f64(model["gain"].value),
         dark_current=f64(model["dark_current"].rate) if "dark_current" in model else f64(0.0),
         read_noise=f64(model["read_noise"].sigma),
-        row_sigma=None if row_gain is None else f64(row_gain.sigma),
+        row_sigma=None if row_gain is None else jnp.maximum(f64(row_gain.sigma), LEAST_ROW_SIGMA),
         exponent=f64(0.0) if row_gain is None else f64(row_gain.exponent),
         black_level=f64(model["black_level"].value) if "black_level" in model else jnp.zeros(n, jnp.float64),
         black_clamp=f64(model["black_clamp"].rate) if "black_clamp" in model else None,

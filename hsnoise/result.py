@@ -23,6 +23,8 @@ TITLES = {
     "synthetic": "Base fit, corrected for added effects by simulated statistics",
 }
 
+NOT_CONVERGED = "NOT CONVERGED: "
+
 
 @dataclass(frozen=True)
 class FitResult:
@@ -52,7 +54,7 @@ class FitResult:
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
-        """Parameter name to (value, standard error, unit); the error is 0 for a value that was given, not fitted,
+        """Parameter name to (value, standard error, unit); the error is 0 for a value that was held, not fitted,
         and infinite where the capture says nothing."""
         fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
         rows_ = {}
@@ -60,6 +62,11 @@ class FitResult:
             error = float(fitted.get(name, np.inf if name == "dark_current.rate" else 0.0))
             rows_[name] = (value, error, unit)
         return rows_
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit ended where it should."""
+        return not self.outcome.startswith(NOT_CONVERGED)
 
     def with_notes(self, notes: tuple[str, ...]) -> FitResult:
         return replace(self, notes=notes)
@@ -124,7 +131,7 @@ def _expected(physics: Physics, c: int, summary: Summary) -> tuple[jax.Array, ja
 def rounded(value: float, error: float) -> tuple[str, str]:
     """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
     if not (np.isfinite(error) and error > 0):
-        return f"{value:.5g}", "given" if error == 0 else "not determined"
+        return f"{value:.5g}", "held" if error == 0 else "not determined"
     digits = max(1 if 0 < abs(value) < 10 else 0, 1 - int(np.floor(np.log10(error))))
     if digits > 6 and abs(value) < 1e-4 or error >= 1e4:
         return f"{value:.3e}", f"{error:.1e}"

@@ -41,6 +41,8 @@ def signals(key, light, shape, effects, capture):
             raise
         if drawn is None:
             raise ValueError(f"{effect.name}: its sample returned None, expected the signal; is a return missing?")
+        if not isinstance(drawn, jax.Array):
+            raise ValueError(f"{effect.name}: its sample returned a {type(drawn).__name__}, expected one array.")
         if np.shape(drawn) != shape:
             raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
         if jnp.iscomplexobj(drawn):

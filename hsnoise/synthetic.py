@@ -16,14 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._threads import in_threads
+from hsnoise._types import unit_in_words
 from hsnoise.coordinates import Coordinates, coordinates_for
 from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_variance, part_of, share_of_far
 from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
+from hsnoise.notes import parameter_notes
 from hsnoise.physics import Physics, physics_of
 from hsnoise.plan import plan_rules
-from hsnoise.result import FitResult
+from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import FrameStack
 from hsnoise.statistics import coding_of, summarise, without_counts
 from hsnoise.structure import structure
@@ -270,6 +272,7 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     here = point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
     scattered = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
+    length = float(np.abs(step / np.sqrt(np.diagonal(scattered))).max())
     return here.y + step * problem.share_of(step), scattered, length, iterations
 
 
@@ -291,8 +294,8 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
     turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
     of_base = "" if base.method == "ml" else f"; of the fit that it starts from: {base.outcome}"
-    met = "simulated statistics met" if last_step < LONG_STEP else "NOT CONVERGED: simulated statistics not met"
-    return replace(
+    met = "simulated statistics met" if last_step < LONG_STEP else f"{NOT_CONVERGED}simulated statistics not met"
+    result = replace(
         base,
         params=problem.in_float64(y),
         physics=problem.physics(y),
@@ -302,8 +305,11 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
         iterations=iterations,
         log_likelihood=float("nan"),
-        notes=(*(base.notes if base.method == "line" else ()), *_notes(problem, covariance)),
     )
+    how = f"{', '.join(problem.extra)}: fitted by simulated statistics (synthetic likelihood), together with all other"
+    of_line = base.notes if base.method == "line" else ()
+    told = (f"{how} parameters.", *of_line, *_loose(problem, covariance, result), *parameter_notes(result))
+    return result.with_notes(tuple(dict.fromkeys(told)))
 
 
 def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -334,18 +340,22 @@ def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return widened
 
 
-def _notes(problem: Problem, covariance: np.ndarray) -> tuple[str, ...]:
+def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[str]:
+    """Sentences on numbers of effects that hardly moved from where the search started; covariance: of y."""
     deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
-    loose = [
-        f"{knob.label} is not determined by this capture: its value is close to where the search started."
-        for knob, sigma in zip(problem.knobs, deviation, strict=True)
-        if sigma > 0.7 * PRIOR_SIGMA
-    ]
-    effects = ", ".join(problem.extra)
-    return (
-        f"{effects}: fitted by simulated statistics (synthetic likelihood), together with all other parameters.",
-        *loose,
-    )
+    told = []
+    for knob, sigma in zip(problem.knobs, deviation, strict=True):
+        if sigma <= 0.7 * PRIOR_SIGMA:
+            continue
+        value, error, unit = result.table[knob.label]
+        if value < 2 * error:
+            below = f"{value + 2 * error:.2g} {unit_in_words(unit)}".rstrip()
+            told.append(f"{knob.label} is compatible with zero (below {below}).")
+        else:
+            told.append(
+                f"{knob.label} is not determined by this capture: its value is close to where the search started."
+            )
+    return told
 
 
 def _weights(problem: Problem, y: np.ndarray, tick) -> tuple[np.ndarray, np.ndarray]:

@@ -64,7 +64,7 @@ def test_printed_result_holds_every_parameter_with_its_error(canon_fit):
     for name, (_, _, unit) in result.table.items():
         line = next(line for line in text.splitlines() if f" {name} " in line)
         assert unit in line
-    assert "converged" in text and "given" in text
+    assert "converged" in text and "held" in text
 
 
 def test_fitted_model_samples_and_survives_its_file(canon_fit, tmp_path):

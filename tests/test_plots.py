@@ -161,7 +161,7 @@ def test_row_spectrum_has_the_power_of_the_row_gain():
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     sigma = fit.table["row_gain.sigma"][0]
     np.testing.assert_allclose(lines["row gain alone"], sigma**2, rtol=1e-9)
-    total = lines["fitted: gain + pixel noise"]
+    total = lines["fitted: row gain + pixel noise"]
     np.testing.assert_allclose(total, lines["row gain alone"] + lines["pixel noise alone"], rtol=1e-9)
     # 24 frequencies of 4 frames: a standard error of 10 %.
     assert abs(lines["measured"].mean() / total.mean() - 1) < 0.4

@@ -131,7 +131,7 @@ def test_a_page_stands_alone(pages, command):
     ("names", "misfit", "words"),
     [
         (("row_noise",), 1.2, "No group of statistics stands out with row_noise in the model. Single statistics"),
-        (("row_noise",), 7.2, "Still far off with row_noise in the model (the worst group, row x frame, by"),
+        (("row_noise",), 7.2, "Still off with row_noise at the first estimate (the worst group, row x frame, by"),
         ((), 1.2, "No group of statistics stands out. Single statistics that are off by more than 3"),
         ((), 7.2, "Far off (the worst group, row x frame, by 7.2 deviations)"),
     ],
@@ -150,7 +150,7 @@ def test_a_page_says_what_was_found(pages, compared):
     assert f"Missing: row_noise; error {error}, 1.0 would be as close" in said["diagnose"]
     assert "Added row_noise, and the error fell from 88.1 to 1.1; nothing significant is left" in said["improve"]
     assert "gain.R moved from 3.1 to 3.5 DN/e-." in said["improve"] and "+80.0 nats" in said["improve"]
-    assert "gain.R 3.54 0.10 DN/e-" in said["improve"] and "black_level.R 64 given DN" in said["improve"]
+    assert "gain.R 3.54 0.10 DN/e-" in said["improve"] and "black_level.R 64 held DN" in said["improve"]
     assert "standard error" in said["improve"] and "standard error" not in said["compare"]
     assert "812.3" in said["diagnose"] and "Curvature needs three exposures." in said["improve"]
     assert "b, c, and 2 more" in said["compare"]

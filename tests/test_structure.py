@@ -252,10 +252,21 @@ def test_noise_that_comes_in_bursts_of_rows_is_told(rng):
         counts.append(np.rint(exposure + burst * rng.normal(0, 3.0, exposure.shape)).clip(0).astype(np.uint16))
     hit = hsnoise.FrameStack(counts, plain.exposure_s, black_level=64.0)
     found, clean = structure(hit, np.array(64.0)), structure(plain, np.array(64.0))
-    for what, least in (("spread", 5), ("next row of the colour", 5)):
+    for what, least in (("spread", 5), ("next row", 5)):
         i = found.names.index(f"blocks: noise of rows, {what}, short exposures")
         assert abs(clean.values[i]) < 4 * clean.error[i]
         assert found.values[i] > least * found.error[i]
+
+
+def test_frames_that_remember_the_one_before_are_told(rng):
+    plain = noise(rng, (8, 8), (96, 128))
+    offset = 2.0 * (-1.0) ** np.arange(8)[:, None, None]
+    counts = [np.rint(exposure + offset).clip(0).astype(np.uint16) for exposure in plain.counts]
+    hit = hsnoise.FrameStack(counts, plain.exposure_s, black_level=64.0)
+    found, clean = structure(hit, np.array(64.0)), structure(plain, np.array(64.0))
+    i = found.names.index("frames over time: frame mean, next frame, short exposures")
+    assert abs(clean.values[i]) < 3 * clean.error[i]
+    assert found.values[i] < -3 * found.error[i]
 
 
 # At half a cycle a line, the colours of a Bayer sensor see an offset, not a line.

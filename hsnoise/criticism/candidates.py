@@ -77,6 +77,8 @@ def built_in(model: NoiseModel, part: FrameStack) -> dict[str, Maker]:
     scale = Scale.of(model, part)
     makers: Mapping[str, Maker] = {**_read_out(scale), **_pixels(scale, part.shutter), **_of_signal(scale)}
     makers |= _dark_signal(scale) if scale.has_exposure else _bias_frames(scale)
+    if model.cfa == "mono" and "row_gain" in model:  # of one colour, it is the same
+        makers = {n: m for n, m in makers.items() if n != "shared_row_gain"}
     if scale.frames < 2:
         makers = {n: m for n, m in makers.items() if n not in FROM_FRAME_TO_FRAME}
     return {name: maker for name, maker in makers.items() if name not in model}

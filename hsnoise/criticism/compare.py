@@ -66,7 +66,7 @@ class Comparison:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(
             f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
-            f" {max(self.groups.values()):.3g}, over that of the model's own samples",
+            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}",
             highlight=False,
         )
         console.print(table)

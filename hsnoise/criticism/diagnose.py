@@ -35,7 +35,7 @@ from hsnoise.criticism.ranking import (
     limit_by_chance,
 )
 from hsnoise.criticism.reference import measure, reference
-from hsnoise.criticism.refine import refined, refined_pair, score_with_base
+from hsnoise.criticism.refine import refined, refined_pair, with_base
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
@@ -102,10 +102,12 @@ def diagnose(
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
         judged = _partners_looked_at(judged, bench, evidence)
         judged = _closer(judged, bench, evidence)
-    judged = _on_its_side(judged, bench, evidence)
+    judged, estimate = _on_its_side(judged, bench, evidence)
     if judged[0].score > EVIDENCE and judged[0].misfit > MISFIT_LEFT:
         pair = _best_pair(judged, {**makers, **own}, bench, evidence)
     ranking = [one.candidate(evidence) for one in judged]
+    if estimate is not None:
+        ranking[0] = replace(ranking[0], effect=estimate)
     laws = {one.of.name: one.of.law(one.amplitude, evidence.null) for one in judged}
     found = _verdict(ranking, pair, evidence, laws)
     if _may_be_a_clamp(found, bench, evidence):
@@ -195,19 +197,24 @@ def _drawn_close(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> Ju
     return judge(of, evidence, CLOSE)
 
 
-def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> list[Judged]:
+def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> tuple[list[Judged], AbstractEffect | None]:
     """The first candidate before or behind the gain, where it describes the capture better, the base fitted to it.
 
     Among random details the side goes with what else was drawn; on a base that the effect has bent, they differ little.
+    The base took a part of the effect for noise of its own: the estimate with another base is the better one, too.
     """
     first = judged[0]
     effect = first.candidate(evidence).effect
     if first.score <= EVIDENCE or not hasattr(effect, "after_gain"):
-        return judged
+        return judged, None
     sides = [replace(effect, **{"after_gain": side}) for side in (False, True)]
-    closer = _drawn_close(max(sides, key=lambda one: score_with_base(one, bench, evidence)), bench, evidence)
+    found = [(*with_base(one, bench, evidence), one) for one in sides]
+    _, estimate, start = max(found, key=lambda one: one[0])
+    closer = _drawn_close(start, bench, evidence)
     # Scores of many draws are lower: rare counts seem to scatter less in few. Far lower, the search has gone astray.
-    return _best_first([closer if closer.score > NEAR * first.score else first, *judged[1:]])
+    if closer.score <= NEAR * first.score:
+        return judged, None
+    return _best_first([closer, *judged[1:]]), estimate if closer.score >= max(o.score for o in judged[1:]) else None
 
 
 def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evidence: Evidence) -> Pair | None:

@@ -16,9 +16,9 @@ from hsnoise.effects import EFFECTS
 MISFIT_LEFT = 3.5  # normal score of the worst group up to which nothing stands out
 WORST = 5
 LEGEND = (
-    "score: log-likelihood ratio of this effect alone against nothing missing (effects resemble each other: the first"
-    " is meant); z left: how far off the worst group of statistics is with it in the model, in deviations of a normal"
-    " law (below 3.5 nothing stands out); p: chance of such a score if nothing is missing"
+    "score: log-likelihood ratio of this effect alone against nothing missing (what resembles the missing one scores,"
+    " too: the first is meant); z left: how far off the worst group of statistics is with it in the model, in"
+    " deviations of a normal law (below 3.5 is chance); p: chance of such a score if nothing is missing"
 )
 NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
 NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
@@ -77,6 +77,14 @@ class Diagnosis:
         """The candidates that the verdict names."""
         return tuple(c for c in self.ranking if c.name in self.names)
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is named, with a first estimate of its parameters, and what to do next."""
+        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
+        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
+        told = (*map(_described, self.named), self.advice, others, *sides, self._next())
+        return tuple(sentence for sentence in told if sentence)
+
     def plot(self):
         """A figure of the ranking: `hsnoise.plots.ranking`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -90,15 +98,22 @@ class Diagnosis:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
         console.print(table)
-        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
-        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
-        after = [self.advice, others, *sides, self._next()]
-        for sentence in (LEGEND, *map(_described, self.named), *after):
+        for sentence in (LEGEND, *self.sentences, self._remains()):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _remains(self) -> str:
+        """What is still off with what is named in the model."""
+        if not self.names or not self.unexplained.stands_out:
+            return ""
+        left, statistics = self.unexplained, "; ".join(self.unexplained.statistics)
+        return (
+            f"still off with {' and '.join(self.names)} at the first estimate (the worst group, {left.group}, by"
+            f" {left.misfit:.1f} deviations; a refit may leave less): {statistics}"
+        )
 
     def _next(self) -> str:
         if self.best is None:
@@ -115,4 +130,4 @@ def _described(candidate: Candidate) -> str:
         value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
         values.append(f"{field} {value} {unit_in_words(spec.unit)}".rstrip())
     values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
-    return f"{effect.name}: {effect.about()} First estimate: {', '.join(values)}."
+    return f"{effect.name}: {effect.about()} First estimate (a fit tells it with its error): {', '.join(values)}."

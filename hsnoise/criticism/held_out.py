@@ -33,7 +33,7 @@ def told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
     return (
         f"Fitted and compared were the first {_span(kept)} dark frames of each exposure; held-out: the log-likelihood"
         f" of the statistics of the other {_span(held_out.n_frames)}, in nats (one more: 2.7 times as probable). To fit"
-        " all of them: hsnoise.fit(stack, model=story.params)."
+        " all of them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
     )
 
 

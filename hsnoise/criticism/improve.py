@@ -34,6 +34,7 @@ NEEDED = 0.1  # share of the misfit of some group, at least, that comes back wit
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
 MOVED_SIGMA = 2.0
+SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is
 FINISHED = "Nothing significant is left"
 UNFINISHED = "Not finished: whether something is missing was being looked for."
 
@@ -47,6 +48,7 @@ class Step:
         added: name of the effect that was added to reach this model; None for the first.
         held_out: synthetic log-likelihood of the held-out frames, nats; NaN without any.
         moved: base parameters that changed by more than two standard errors in this step, in words.
+        ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
     """
 
     fit: FitResult
@@ -55,11 +57,15 @@ class Step:
     added: str | None
     held_out: float
     moved: tuple[str, ...]
+    ahead: float = float("nan")
 
     @property
     def sizes(self) -> tuple[str, ...]:
         """What was fitted of the effect that was added, and what was chosen for it, in words."""
-        return () if self.added is None else _sizes(self.fit, self.added)
+        if self.added is None:
+            return ()
+        open_ = f"{self.added} fits as well on the other side of the gain: these frames do not tell which it is on."
+        return (*_sizes(self.fit, self.added), *([open_] if self.ahead < SIDES_APART else []))
 
 
 @dataclass(frozen=True)
@@ -125,7 +131,8 @@ class Story:
                 )
             for sentence in (*step.sizes, *step.moved):
                 console.print(f"  {sentence}", highlight=False)
-        for sentence in (self.ended, self.split):
+        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+        for sentence in (self.ended, care, self.split):
             if sentence:
                 console.print(sentence, highlight=False)
         return console.file.getvalue().rstrip()
@@ -231,10 +238,11 @@ class _Work:
                 self.say(f"{effect.name} cannot be fitted here: {error}")
         if not fits:
             return None
-        best = (
-            fits[0] if len(fits) == 1 else max(fits, key=lambda one: log_likelihood(one.params, self.fitted, self.seed))
-        )
-        return self.step(best, candidate.name, steps[-1])
+        if len(fits) == 1:
+            return self.step(fits[0], candidate.name, steps[-1])
+        values = [log_likelihood(one.params, self.fitted, self.seed) for one in fits]
+        step = self.step(fits[int(np.argmax(values))], candidate.name, steps[-1])
+        return replace(step, ahead=abs(values[0] - values[1]))
 
 
 def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
@@ -368,6 +376,6 @@ def _because(before: Step, after: Step) -> str:
     else:
         score = next((one.score for one in found.ranking if one.name == after.added), 0.0) if found else 0.0
         reason = f"its fingerprint is in the statistics (score {score:.0f} nats)"
-    if found is not None and found.verdict == "unexplained":
+    if found is not None and found.verdict == "unexplained" and after.comparison.error > CHANCE_ERROR:
         return f"{reason} (no effect explains all that is off; this one comes nearest)"
     return reason

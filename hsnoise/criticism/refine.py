@@ -55,8 +55,8 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
     return max(pair, again, key=lambda one: one.score)
 
 
-def score_with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> float:
-    """Log-likelihood ratio of an effect whose parameters, and those of the base, were brought close to the capture.
+def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple[float, AbstractEffect]:
+    """The log-likelihood ratio of an effect, and the effect, its parameters and the base's brought close to the capture.
 
     Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
     no evidence that there is the effect at all: nothing of the base is held against it.
@@ -75,7 +75,7 @@ def score_with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) ->
 
     there = _stepped(model, [*numbers[0], *numbers[1]], step, bench)
     shifts = np.stack(in_threads(lambda number: bench.shift(there, number), range(MANY_DRAWS), bench.tick))
-    return evidence.score(_law_nearby(shifts, own))
+    return evidence.score(_law_nearby(shifts, own)), there[effect.name]
 
 
 def _stepped(model: NoiseModel, turned: list[Knob], step_of: Step, bench: Bench) -> NoiseModel:

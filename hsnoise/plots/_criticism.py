@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
 from hsnoise.result import number
@@ -15,6 +15,7 @@ BAR, ALARM = COLOURS["B"], COLOURS["R"]
 ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
 MOST_TICKS = 3  # to either side of 0
 MOST_DECADES = 4  # named below the errors of a story
+SHORT_RANGE = 30.0  # of errors, that needs more than decades
 LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
@@ -37,7 +38,9 @@ def comparison(found) -> Figure:
     left.set_xlim(LEAST_MISFIT, 2 * max(misfits.max(), 10.0))
     left.axvline(1.0, color=FIT, linewidth=0.8)
     left.axvline(own, color=FIT, linewidth=0.8, linestyle="--")
-    left.set_xlabel(f"misfit (line: 1, expected; dashed: its own samples,\n{own:.2g}; orange: more than twice that)")
+    left.set_xlabel(
+        f"misfit (line: 1, expected; dashed: the model's own\nsamples, {own:.2g}; orange: more than twice that)"
+    )
     left.set_title("groups of statistics", fontsize=10)
     left.xaxis.set_major_locator(LogLocator(numticks=5))
     left.xaxis.set_major_formatter(_plain)
@@ -93,8 +96,10 @@ def story(found) -> Figure:
     axes.set_xscale("log")
     low, high = min(0.5, 0.7 * min(found.errors)), max(2.0, *found.errors)
     axes.set_xlim(low, high * (high / low) ** 0.22)  # room for the last number
-    axes.xaxis.set_major_locator(LogLocator(numticks=MOST_DECADES))
+    within = (1.0, 2.0, 5.0) if high < SHORT_RANGE * low else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=within, numticks=MOST_DECADES))
     axes.xaxis.set_major_formatter(_plain)
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(len(names) - 0.5, -0.6)
     axes.set_yticks(y, names)
     axes.set_xlabel("error (dotted: 1, the model's own samples)")

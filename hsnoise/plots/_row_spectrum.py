@@ -15,8 +15,9 @@ from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3
 SMALLEST_SIGMA = 1e-6
-LARGEST_RANGE = 1e6  # a row gain further below the measurement is off the figure
-LEGEND = ("measured", "measured, in bands", "fitted: gain + pixel noise", "row gain alone", "pixel noise alone")
+FAINT = 0.01  # of the least power that is measured: a row gain below that is left out
+ALONE = "row gain alone"
+LEGEND = ("measured", "measured, in bands", "fitted: row gain + pixel noise", ALONE, "pixel noise alone")
 
 
 def row_spectrum(fit) -> Figure:
@@ -43,12 +44,16 @@ def row_spectrum(fit) -> Figure:
     panels = figure.subplots(1, channels, squeeze=False, sharey=True)[0]
     for c, (axes, histograms) in enumerate(zip(panels, summary.histograms, strict=True)):
         _panel(axes, physics, c, histograms, summary)
-    low, high = min(one.dataLim.y0 for one in panels), max(one.dataLim.y1 for one in panels)
-    panels[0].set_ylim(0.5 * max(low, high / LARGEST_RANGE), 2 * high)
+    lines = [line for one in panels for line in one.lines]
+    low = min(float(np.min(line.get_ydata())) for line in lines if line.get_label() != ALONE)
+    shown = [line for line in lines if line.get_label() != ALONE or np.max(line.get_ydata()) > FAINT * low]
+    ends = np.concatenate([np.asarray(line.get_ydata(), float) for line in shown])
+    panels[0].set_ylim(0.5 * ends.min(), 2 * ends.max())
     panels[0].set_ylabel("power of the row gain β (variance per row)")
     entries = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
-    order = [entries[label] for label in LEGEND]
-    figure.legend(order, LEGEND, loc="outside lower center", ncols=min(len(LEGEND), 2 * channels + 1), fontsize=9)
+    labels = [label for label in LEGEND if any(line.get_label() == label for line in shown)]
+    order = [entries[label] for label in labels]
+    figure.legend(order, labels, loc="outside lower center", ncols=min(len(labels), 2 * channels + 1), fontsize=9)
     return figure
 
 
@@ -76,7 +81,7 @@ def _panel(axes: Axes, physics: Physics, c: int, histograms: RowHistograms, summ
         capsize=3,
         label="measured, in bands",
     )
-    axes.plot(k, fitted + floor, color=FIT, linewidth=1.8, label="fitted: gain + pixel noise")
+    axes.plot(k, fitted + floor, color=FIT, linewidth=1.8, label="fitted: row gain + pixel noise")
     axes.plot(k, fitted, "--", color=FIT, linewidth=1.2, label="row gain alone")
     axes.plot(k, np.full(len(k), floor), ":", color="0.5", linewidth=1.8, label="pixel noise alone")
     axes.set_title(f"{NAMES[channel]}, {_count(frames)} of {seconds(summary.exposure_s[e])}", fontsize=10)

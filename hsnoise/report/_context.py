@@ -121,13 +121,16 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     """Rows of the parameter table, with what was chosen for effects; "error" only for a FitResult."""
     model = fit if isinstance(fit, NoiseModel) else fit.params
     settings = [(e.name, n, v) for e in model.effects for n, v in e.settings().items() if v is not None]
-    chosen = [{"name": f"{name}.{field}", "value": f"{value}", "unit": ""} for name, field, value in settings]
+    chosen = [
+        {"name": f"{name}.{field}", "value": f"{value:g}" if isinstance(value, float) else f"{value}", "unit": ""}
+        for name, field, value in settings
+    ]
     if isinstance(fit, NoiseModel):
         found = [(name, f"{value:.5g}", unit_in_words(unit)) for name, (value, unit) in fit.table().items()]
         return [*(dict(zip(("name", "value", "unit"), row, strict=True)) for row in found), *chosen]
     cells = [(name, *rounded(value, error), unit_in_words(unit)) for name, (value, error, unit) in fit.table.items()]
     rows = [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in cells]
-    return [*rows, *({**row, "error": "chosen"} for row in chosen)]
+    return [*rows, *({**row, "error": "held"} for row in chosen)]
 
 
 def bars(comparison: Comparison) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def frames(at: Shown) -> dict[str, Any]:
     rows, columns = pair[0].shape
     part = f"{'All' if pair[0].shape == at.measured.shape[1:] else 'The middle'} {rows} x {columns} pixels"
     measured, drawn = (_png(np.clip((one - low) / (high - low), 0, 1)) for one in pair)
-    return {"measured": measured, "drawn": drawn, "low": f"{low:g}", "high": f"{high:g}", "part": part}
+    return {"measured": measured, "drawn": drawn, "low": f"{low:.4g}", "high": f"{high:.4g}", "part": part}
 
 
 def _png(grey: np.ndarray) -> str:

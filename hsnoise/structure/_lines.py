@@ -55,11 +55,12 @@ def colours(sheet: Sheet, x: Exposure) -> None:
     for label, pairs in labels.items():
         values = [correlation(x.row_frame[j], x.row_frame[i], (0, 1)) for j, i in pairs]
         sheet.add("row x frame", f"correlation, {label}", values, 1 / np.sqrt(n_rows * len(pairs)))
+    of_colour = " of the colour" if planes == 4 else ""
     near = _next(x.row_frame, 2)
-    sheet.add_colours("row x frame", "correlation with the next row of the colour", near, 1 / np.sqrt(n_rows))
+    sheet.add_colours("row x frame", f"correlation with the next row{of_colour}", near, 1 / np.sqrt(n_rows))
     near = _next(x.column_frame, 2)
     error = 1 / np.sqrt(n_columns * planes)
-    sheet.add("column x frame", "correlation with the next column of the colour", near, error)
+    sheet.add("column x frame", f"correlation with the next column{of_colour}", near, error)
     if planes == 4:
         values = [correlation(x.column_frame[j], x.column_frame[i], (0, 1)) for j, i in SAME_COLUMN]
         sheet.add("column x frame", "correlation, same column", values, 1 / np.sqrt(n_columns * 2))
@@ -111,7 +112,8 @@ def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
     spread = (spread - spread.mean((1, 2), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
     n = planes * frames * rows
     sheet.add("blocks", "noise of rows, spread", log_ratio(np.square(spread).mean((1, 2)), 1.0), np.sqrt(2 / n))
-    sheet.add("blocks", "noise of rows, next row of the colour", _next(spread, 2), 1 / np.sqrt(n))
+    of_colour = " of the colour" if planes == 4 else ""
+    sheet.add("blocks", f"noise of rows, next row{of_colour}", _next(spread, 2), 1 / np.sqrt(n))
 
 
 def _haar(profile: np.ndarray) -> list[np.ndarray]:

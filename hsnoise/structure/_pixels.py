@@ -183,6 +183,8 @@ def frames_over_time(sheet: Sheet, x: Exposure) -> None:
     error = np.sqrt(2 / (planes * (frames - 2)))
     sheet.add(group, "detrended frame mean / pixel", log_ratio((means**2).sum(1) / (frames - 2), 1.0), error)
     sheet.add(group, "jitter of the noise", log_ratio((spreads**2).sum(1) / (frames - 2), 1.0), error)
+    common = means.sum(0)
+    sheet.add(group, "frame mean, next frame", correlation(common[1:], common[:-1], (0,)), 1 / np.sqrt(frames - 2))
     alternating = (-1.0) ** np.arange(frames) / np.sqrt(frames)
     sheet.add(group, "noise of even and odd frames", abs((spreads @ alternating).sum()) / together, 0.6)
     if planes == 4:

@@ -31,6 +31,7 @@ class Mine(hsnoise.AbstractEffect):
 FAULTS = {
     "shape": (lambda signal: signal[:, 1:], r"my_effect: .* returned shape \(\d+, 31, 48\), expected \(\d+, 32, 48\)"),
     "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
+    "two": (lambda signal: (signal, signal), "my_effect: .* returned a tuple, expected one array"),
     "nothing": (lambda signal: None, "my_effect: .* returned None, .* is a return missing"),
     "complex": (lambda signal: signal + 1j, "my_effect: .* complex numbers"),
     "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity in .* % of the pixels"),
