@@ -15,13 +15,14 @@ LEAST_OUTLIERS = 5  # pixels; fewer are chance
 MISPLACED_FRACTION = 0.03
 LIGHT_E_PER_S = 2e4  # a dark current above this looks like light
 LIT_SIGMA = 5.0  # standard deviations of a pixel above black that no short dark is
+WARMING, WARMING_SIGMA, FEWEST_IN_SERIES = 0.05, 8.0, 4  # share of the dark signal, standard errors, frames
 DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 
 
 def closing_notes(result: FitResult) -> tuple[str, ...]:
     """All sentences that belong under the table of `result`."""
     misfit = _misfit_notes(result) if result.summary.histograms else _flat_notes(result)
-    return (*parameter_notes(result), *misfit, *_order_note(result), *_light_note(result))
+    return (*parameter_notes(result), *misfit, *_order_note(result), *_warming_note(result), *_light_note(result))
 
 
 def parameter_notes(result: FitResult) -> list[str]:
@@ -148,6 +149,39 @@ def _order_note(result: FitResult) -> list[str]:
                 " exposures right? If so, the camera subtracts its dark level, which this model does not describe."
             ]
     return []
+
+
+def _warming_note(result: FitResult) -> list[str]:
+    """Means that drift from the first frame of an exposure to the last, where that is most."""
+    found = [(abs(change), change, e) for e, change in enumerate(_drifts(result)) if abs(change) > WARMING]
+    if not found:
+        return []
+    _, change, e = max(found)
+    return [
+        f"The dark signal {'rises' if change > 0 else 'falls'} by {abs(change):.0%} from the first frame at"
+        f" {result.summary.exposure_s[e]:g} s to the last: the sensor changes its temperature, or light gets in. Let it"
+        " settle before a series; hsnoise diagnose tells whether the drift matters."
+    ]
+
+
+def _drifts(result: FitResult) -> list[float]:
+    """Relative change of the dark signal over the frames of an exposure, along a straight line; 0 if within chance."""
+    summary, drifts = result.summary, []
+    black = float(np.mean(np.asarray(result.physics.black_level)))
+    for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
+        pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
+        means = sum(h.row_sum[e, :frames].sum(1) for h in summary.histograms) / np.maximum(pixels, 1) - black
+        drifts.append(_trend(means) / means.mean() if frames >= FEWEST_IN_SERIES and means.mean() > 0 else 0.0)
+    return drifts
+
+
+def _trend(values: np.ndarray) -> float:
+    """Change from the first to the last of a series along a straight line; 0 if the scatter about it makes as much."""
+    time = np.arange(len(values)) - (len(values) - 1) / 2
+    slope = float(time @ values / (time @ time))
+    left = values - values.mean() - slope * time
+    error = np.sqrt(left @ left / (len(values) - 2) / (time @ time))
+    return slope * (len(values) - 1) if abs(slope) > WARMING_SIGMA * error else 0.0
 
 
 def _light_note(result: FitResult) -> list[str]:

@@ -140,6 +140,19 @@ def test_a_camera_without_row_gain_has_a_bound_for_it(seed):
     assert any("row_gain.sigma is compatible with zero" in note for note in result.notes)
 
 
+@pytest.mark.parametrize(("change", "told"), [(0.3, True), (-0.2, True), (0.0, False)])
+def test_a_sensor_that_warms_up_is_told(change, told, rng):
+    exposure_s, light = (0.05, 0.5), 1 + change * np.linspace(0, 1, 6)[:, None, None]
+    counts = [
+        np.rint(64 + 1.5 * rng.poisson(120 * t * light, (6, 48, 64)) + rng.normal(0, 3, (6, 48, 64))).astype(np.uint16)
+        for t in exposure_s
+    ]
+    stack = hsnoise.FrameStack(counts, exposure_s, black_level=64, shutter="global")
+    notes = [note for note in hsnoise.fit(stack, method="line").notes if "from the first frame" in note]
+    assert len(notes) == told
+    assert not told or f"{'rises' if change > 0 else 'falls'} by" in notes[0]
+
+
 def assert_gain_not_determined(model, exposure_s, black_level, seed):
     result = hsnoise.fit(capture(model, seed=seed, exposure_s=(exposure_s,), black_level=black_level))
     assert result.outcome.startswith("converged")

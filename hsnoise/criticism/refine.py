@@ -56,7 +56,7 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
 
 
 def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple[float, AbstractEffect]:
-    """Log-likelihood ratio of an effect, and the effect: its parameters and those of the base brought close to the data.
+    """Log-likelihood ratio of an effect, and the effect, with its parameters and the base brought close to the capture.
 
     Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
     no evidence that there is the effect at all: nothing of the base is held against it.
