@@ -51,7 +51,8 @@ def row_spectrum(fit) -> Figure:
     panels[0].set_ylim(0.5 * ends.min(), 2 * ends.max())
     panels[0].set_ylabel("power of the row gain β (variance per row)")
     entries = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
-    labels = [label for label in LEGEND if any(line.get_label() == label for line in shown)]
+    is_faint = all(line.get_label() != ALONE for line in shown)
+    labels = [label for label in LEGEND if label != ALONE or not is_faint]
     order = [entries[label] for label in labels]
     figure.legend(order, labels, loc="outside lower center", ncols=min(len(labels), 2 * channels + 1), fontsize=9)
     return figure
