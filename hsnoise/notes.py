@@ -167,11 +167,12 @@ def _warming_note(result: FitResult) -> list[str]:
 def _drifts(result: FitResult) -> list[float]:
     """Relative change of the dark signal over the frames of an exposure, along a straight line; 0 if within chance."""
     summary, drifts = result.summary, []
+    least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # of a signal that may be called one
     black = float(np.mean(np.asarray(result.physics.black_level)))
     for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
         pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
         means = sum(h.row_sum[e, :frames].sum(1) for h in summary.histograms) / np.maximum(pixels, 1) - black
-        drifts.append(_trend(means) / means.mean() if frames >= FEWEST_IN_SERIES and means.mean() > 0 else 0.0)
+        drifts.append(_trend(means) / means.mean() if frames >= FEWEST_IN_SERIES and means.mean() > least else 0.0)
     return drifts
 
 
