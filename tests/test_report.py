@@ -19,7 +19,7 @@ from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.diagnose import Unexplained
 from hsnoise.draws import draw_capture
 from hsnoise.report import _context, _figures, _measured
-from hsnoise.result import FitResult
+from hsnoise.result import NOT_CONVERGED, FitResult
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 PLAIN = MODEL.remove("row_gain")  # its likelihood takes less time
@@ -297,3 +297,13 @@ def test_nothing_overflows(pages, command, width, scheme, browser, tmp_path):
     background = shown.evaluate("getComputedStyle(document.body).backgroundColor")
     assert background == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 23, 26)")
     shown.close()
+
+
+def test_a_story_says_what_is_open(story):
+    first, last = story.steps
+    unmet = replace(last.fit, outcome=f"{NOT_CONVERGED}simulated statistics not met")
+    told = str(replace(story, steps=(first, replace(last, ahead=2.0, fit=unmet))))
+    assert "row_noise fits as well on the other side of the gain" in told
+    assert "the last fit has NOT CONVERGED" in told
+    assert "other side" not in str(replace(story, steps=(first, replace(last, ahead=20.0))))
+    assert "NOT CONVERGED" not in str(story)
