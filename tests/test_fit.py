@@ -127,7 +127,7 @@ def test_model_without_row_gain_is_fitted_without():
     assert "row_gain.sigma.R" not in result.table and "row_gain" not in result.params
 
 
-@pytest.mark.parametrize("seed", [100, 102, 103])
+@pytest.mark.parametrize("seed", [100, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (102, 103))])
 def test_a_camera_without_row_gain_has_a_bound_for_it(seed):
     rng = np.random.default_rng(seed)
     exposure_s = (0.01, 0.1, 0.5, 2.0)
@@ -414,6 +414,7 @@ def test_rows_that_conflict_with_the_start_do_not_end_a_fit():
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_a_black_level_at_a_step_of_the_likelihood_is_known_to_half_a_count_only(shared_data):
     """Row noise taken for row gain: the model clips the gain of rows at 0, which lie on one count then."""
     with np.load(shared_data / "cases" / "case_c.npz") as data:
