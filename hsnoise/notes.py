@@ -30,6 +30,11 @@ def parameter_notes(result: FitResult) -> list[str]:
     return [note for name, row in result.table.items() if (note := _note(name, row, result))]
 
 
+def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
+    """That a size may be 0, and what it is below, in words."""
+    return f"{name} is compatible with zero (below {f'{value + 2 * error:.2g} {unit}'.rstrip()})"
+
+
 def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:
     value, error, unit = row
     parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
@@ -46,7 +51,7 @@ def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | 
     if parameter == "row_gain.sigma" and np.isinf(error):
         return f"{name} is not determined: add darks of longer exposures, or flats."
     if parameter == "row_gain.sigma" and value < 4 * error:
-        return f"{name} is compatible with zero (below {value + 2 * error:.2g})."
+        return f"{near_zero(name, value, error)}."
     if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
         return f"{name} is not determined: the row gain is too weak here to have a spectrum."
     if parameter == "black_level" and name in result.names and error > 1.0:
@@ -66,7 +71,7 @@ def _dark_current_note(value: float, error: float, result: FitResult) -> str | N
     if value < 2 * error:
         longest = max(exposures)
         return (
-            f"dark_current.rate is compatible with zero (below {value + 2 * error:.2g} e-/s);"
+            f"{near_zero('dark_current.rate', value, error, 'e-/s')};"
             f" darks longer than {longest:g} s would determine it."
         )
     return None

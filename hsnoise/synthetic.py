@@ -22,7 +22,7 @@ from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_varianc
 from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at, replan
 from hsnoise.model import NoiseModel
-from hsnoise.notes import parameter_notes
+from hsnoise.notes import near_zero, parameter_notes
 from hsnoise.physics import Physics, physics_of
 from hsnoise.plan import plan_rules
 from hsnoise.result import NOT_CONVERGED, FitResult
@@ -272,7 +272,6 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     here = point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
     scattered = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
-    length = float(np.abs(step / np.sqrt(np.diagonal(scattered))).max())
     return here.y + step * problem.share_of(step), scattered, length, iterations
 
 
@@ -349,8 +348,7 @@ def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[
             continue
         value, error, unit = result.table[knob.label]
         if value < 2 * error:
-            below = f"{value + 2 * error:.2g} {unit_in_words(unit)}".rstrip()
-            told.append(f"{knob.label} is compatible with zero (below {below}).")
+            told.append(f"{near_zero(knob.label, value, error, unit_in_words(unit))}.")
         else:
             told.append(
                 f"{knob.label} is not determined by this capture: its value is close to where the search started."

@@ -11,8 +11,8 @@ from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
 from hsnoise.synthetic import (
     LAST_DRAWS,
-    LONG_STEP,
     MOST_ITERATIONS,
+    SHORT_STEP,
     Problem,
     _as_scattered,
     _not_surer_than,
@@ -140,7 +140,7 @@ class Bent:
 def test_a_step_that_leads_away_is_taken_back():
     problem = Bent()
     y, covariance, length, iterations = _search(problem, lambda: None)
-    assert length < LONG_STEP and iterations < MOST_ITERATIONS
+    assert length < SHORT_STEP and iterations < MOST_ITERATIONS
     assert np.all(np.abs(y - problem.truth) < 4 * np.sqrt(np.diagonal(covariance)))
     assert np.all(np.sqrt(np.diagonal(covariance)) < 0.05)
 

@@ -214,7 +214,8 @@ def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> tupl
     # Scores of many draws are lower: rare counts seem to scatter less in few. Far lower, the search has gone astray.
     if closer.score <= NEAR * first.score:
         return judged, None
-    return _best_first([closer, *judged[1:]]), estimate if closer.score >= max(o.score for o in judged[1:]) else None
+    again = _best_first([closer, *judged[1:]])
+    return again, estimate if again[0] is closer else None
 
 
 def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evidence: Evidence) -> Pair | None:

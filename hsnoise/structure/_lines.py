@@ -55,12 +55,11 @@ def colours(sheet: Sheet, x: Exposure) -> None:
     for label, pairs in labels.items():
         values = [correlation(x.row_frame[j], x.row_frame[i], (0, 1)) for j, i in pairs]
         sheet.add("row x frame", f"correlation, {label}", values, 1 / np.sqrt(n_rows * len(pairs)))
-    of_colour = " of the colour" if planes == 4 else ""
     near = _next(x.row_frame, 2)
-    sheet.add_colours("row x frame", f"correlation with the next row{of_colour}", near, 1 / np.sqrt(n_rows))
+    sheet.add_colours("row x frame", f"correlation with the {_next_line('row', planes)}", near, 1 / np.sqrt(n_rows))
     near = _next(x.column_frame, 2)
     error = 1 / np.sqrt(n_columns * planes)
-    sheet.add("column x frame", f"correlation with the next column{of_colour}", near, error)
+    sheet.add("column x frame", f"correlation with the {_next_line('column', planes)}", near, error)
     if planes == 4:
         values = [correlation(x.column_frame[j], x.column_frame[i], (0, 1)) for j, i in SAME_COLUMN]
         sheet.add("column x frame", "correlation, same column", values, 1 / np.sqrt(n_columns * 2))
@@ -81,6 +80,10 @@ def _next(moving: np.ndarray, axis: int) -> np.ndarray:
     after, before = (np.take(moving, range(*ends), axis) for ends in ((1, n), (n - 1,)))
     # What sums to zero over n has correlation -1/(n - 1).
     return correlation(after, before, (1, 2)) + 1 / (n - 1)
+
+
+def _next_line(line: str, planes: int) -> str:
+    return f"next {line} of the colour" if planes > 1 else f"next {line}"
 
 
 def scales(sheet: Sheet, x: Exposure) -> None:
@@ -112,8 +115,7 @@ def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
     spread = (spread - spread.mean((1, 2), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
     n = planes * frames * rows
     sheet.add("blocks", "noise of rows, spread", log_ratio(np.square(spread).mean((1, 2)), 1.0), np.sqrt(2 / n))
-    of_colour = " of the colour" if planes == 4 else ""
-    sheet.add("blocks", f"noise of rows, next row{of_colour}", _next(spread, 2), 1 / np.sqrt(n))
+    sheet.add("blocks", f"noise of rows, {_next_line('row', planes)}", _next(spread, 2), 1 / np.sqrt(n))
 
 
 def _haar(profile: np.ndarray) -> list[np.ndarray]:
