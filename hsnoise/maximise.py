@@ -13,7 +13,7 @@ import numpy as np
 
 from hsnoise.coordinates import Coordinates
 from hsnoise.physics import Physics, Rules, evaluate
-from hsnoise.plan import plan_rules
+from hsnoise.plan import plan_rules, replan
 from hsnoise.statistics import Summary, every_nth_row, some_frames, without_counts
 
 ROUNDS = 16
@@ -289,16 +289,6 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     scale = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / scale[:, None] / scale[None, :])
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-15))
-
-
-def replan(old: Rules, new: Rules) -> Rules:
-    """New rules with the old numbers of nodes where they are enough, which spares a compilation."""
-
-    def enough(old, new):
-        pairs = zip(old.blocks, new.blocks, strict=True)
-        return replace(new, blocks=tuple(replace(n, nodes=max(o.nodes, n.nodes)) for o, n in pairs))
-
-    return tuple(enough(o, n) for o, n in zip(old, new, strict=True))
 
 
 def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:

@@ -45,23 +45,30 @@ class Physics(eqx.Module):
 
 
 class Block(eqx.Module):
-    """Groups of rows that share a number of nodes: counts [part, group, row, bin], beta in low..high [part, group]."""
+    """Groups of rows that share a number of nodes: counts [part, group, row, bin], beta in low..high [part, group].
+
+    open_below: whether the nodes of a group begin where the prior ends, or at zero, before its rows' curves vanish.
+    """
 
     counts: np.ndarray
     low: np.ndarray
     high: np.ndarray
     nodes: int = eqx.field(static=True)
+    open_below: bool = eqx.field(static=True)
 
 
 class RowRule(eqx.Module):
     """Rows sorted into groups of similar gain, and the quadrature that resolves them, for channels of one row_stride.
 
     A part is one channel in one exposure, told by `channel` and `exposure` [part]; scale [part] spaces the nodes.
+    edges_dn [part, bin - 1] and outlier_law [part, bin] are those of RowHistograms for the bins of `counts`.
     Without a row gain each part has one row, the sum of all, and there is no layout.
     """
 
     channel: np.ndarray
     exposure: np.ndarray
+    edges_dn: np.ndarray
+    outlier_law: np.ndarray
     blocks: tuple[Block, ...]
     layout: rows.Layout | None
     scale: np.ndarray
@@ -122,7 +129,7 @@ def rows_log_likelihood(physics: Physics, rule: RowRule, laws, summary: Summary)
         sigma = physics.row_sigma[at.channel]
         curves = []
         for block in blocks:
-            nodes = rows.make_nodes(block.low, block.high, scale, sigma, block.nodes)
+            nodes = rows.make_nodes(block.low, block.high, scale, sigma, block.nodes, block.open_below)
             table = log_probability(physics, at, nodes.beta.ravel()).reshape(*nodes.beta.shape, -1)
             curves.append((_curves(block.counts, table), nodes))
         of_rows = rows.Curves(tuple(curves), layout)
@@ -131,22 +138,31 @@ def rows_log_likelihood(physics: Physics, rule: RowRule, laws, summary: Summary)
         spectrum = rows.row_spectrum(physics.exponent, summary.shape[0], rule.row_stride, sigma.dtype)
         return rows.log_evidence_coloured(of_rows, sigma**2 * spectrum).sum()
 
-    at = binning(summary, laws, rule.channel, rule.exposure)
+    at = binning(summary, laws, rule.channel, rule.exposure, rule.edges_dn, rule.outlier_law)
     return _sum_with_gradient(part, physics, jax.tree.map(jnp.asarray, (at, rule.blocks, rule.layout, rule.scale)))
 
 
+@jax.custom_vjp
 def _curves(counts, table):
     """Log-likelihood of each row at the nodes of its group [group, row, node].
 
-    Group by group, so that the counts as floats stay in the cache: a quarter of the time of all at once.
+    Group by group, so that the counts as floats stay in the cache: a quarter of the time of all at once. The way back
+    is in float32, which counts fit into: a sum of shares of pixels, of which the noise is far above its rounding.
     """
+    return jax.lax.map(lambda x: x[0].astype(x[1].dtype) @ x[1].T, (counts, table))
 
-    @jax.checkpoint
-    def group(inputs):
-        counts, table = inputs
-        return counts.astype(table.dtype) @ table.T
 
-    return jax.lax.map(group, (counts, table))
+def _curves_forward(counts, table):
+    return _curves(counts, table), (counts, jnp.zeros((), table.dtype))
+
+
+def _curves_backward(kept, cotangent):
+    counts, like = kept
+    slope = jax.lax.map(lambda x: x[1].T @ x[0].astype(jnp.float32), (counts, cotangent.astype(jnp.float32)))
+    return None, slope.astype(like.dtype)
+
+
+_curves.defvjp(_curves_forward, _curves_backward)
 
 
 class Binning(NamedTuple):
@@ -160,15 +176,11 @@ class Binning(NamedTuple):
     outlier_law: jax.Array
 
 
-def binning(summary: Summary, laws, channel, exposure) -> Binning:
-    """The Binning of parts, given by their channels and exposures [part], with a leading axis for the parts."""
-    edges, outlier = (
-        jnp.stack([jnp.asarray(getattr(h, name)) for h in summary.histograms]) for name in ("edges_dn", "outlier_law")
-    )
-    channel, exposure = jnp.asarray(channel), jnp.asarray(exposure)
+def binning(summary: Summary, laws, channel, exposure, edges_dn, outlier_law) -> Binning:
+    """The Binning of parts, given by their channels, exposures and bins, with a leading axis for the parts."""
+    channel, exposure, edges_dn, outlier_law = map(jnp.asarray, (channel, exposure, edges_dn, outlier_law))
     law = jax.tree.map(lambda x: x[exposure], laws)
-    seconds = jnp.asarray(summary.exposure_s)[exposure]
-    return Binning(channel, exposure, seconds, law, edges[channel, exposure], outlier[channel, exposure])
+    return Binning(channel, exposure, jnp.asarray(summary.exposure_s)[exposure], law, edges_dn, outlier_law)
 
 
 def _sum_with_gradient(function, physics: Physics, inputs):

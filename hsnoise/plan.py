@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -21,7 +22,9 @@ MARGIN = 1.35  # in beta on either side, so that the parameters may move during 
 EXTREME_ROWS = 6
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
-GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
+# Further nodes: where the integrand ends at a gain of zero, or each of few rows counts; and where errors average out.
+SPARE, SPARE_OF_MANY = 16, 4
+GROUP_ROWS, MOST_GROUPS, SPLIT_FROM, ENDS = 192, 24, 8, 3
 
 
 def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN, channel: int | None = None) -> Rules:
@@ -48,28 +51,82 @@ def _rule(physics: Physics, chosen: list[int], summary: Summary, margin: float) 
     stride = summary.histograms[chosen[0]].row_stride
     exposures = len(summary.exposure_s)
     channel, exposure = np.repeat(chosen, exposures), np.tile(np.arange(exposures), len(chosen))
+    histograms = _used_bins([summary.histograms[c] for c in chosen])
+    edges, outliers = (np.concatenate([getattr(h, name) for h in histograms]) for name in ("edges_dn", "outlier_law"))
     if physics.row_sigma is None:
-        pooled = [summary.histograms[c].counts.sum((1, 2), dtype=np.float64) for c in chosen]
+        pooled = [h.counts.sum((1, 2), dtype=np.float64) for h in histograms]
         ones = np.ones((len(channel), 1))
-        block = Block(np.concatenate(pooled)[:, None, None, :], ones, ones, 1)
-        return RowRule(channel, exposure, (block,), None, ones[:, 0], stride)
-    channels = [_channel_blocks(physics, c, summary, margin) for c in chosen]
+        block = Block(np.concatenate(pooled)[:, None, None, :], ones, ones, nodes=1, open_below=False)
+        return RowRule(channel, exposure, edges, outliers, (block,), None, ones[:, 0], stride)
+    channels = [_channel_blocks(physics, c, h, summary, margin) for c, h in zip(chosen, histograms, strict=True)]
     layouts, scales, blocks = zip(*channels, strict=True)
     join = partial(jax.tree.map, lambda *x: np.concatenate(x))
-    nodes = [max(b.nodes for b in same) for same in zip(*blocks, strict=True)]
-    joined = [
-        join(*(replace(b, nodes=n) for b in same)) for same, n in zip(zip(*blocks, strict=True), nodes, strict=True)
-    ]
-    return RowRule(channel, exposure, tuple(joined), join(*layouts), np.concatenate(scales), stride)
+    joined = [join(*(like(b, same) for b in same)) for same in zip(*blocks, strict=True)]
+    return RowRule(channel, exposure, edges, outliers, tuple(joined), join(*layouts), np.concatenate(scales), stride)
 
 
-def _channel_blocks(physics: Physics, c: int, summary: Summary, margin: float):
+def like(block: Block, others: Sequence[Block]) -> Block:
+    """A block with as many nodes as the `others` have, so that they share a program."""
+    blocks = block, *others
+    return replace(block, nodes=max(b.nodes for b in blocks), open_below=any(b.open_below for b in blocks))
+
+
+def replan(old: Rules, new: Rules) -> Rules:
+    """New rules with the old numbers of nodes and bins where they are enough, which spares a compilation."""
+
+    def enough(old, new):
+        new = _with_bins(new, old.outlier_law.shape[-1])
+        pairs = zip(old.blocks, new.blocks, strict=True)
+        return replace(new, blocks=tuple(like(n, [o]) for o, n in pairs))
+
+    return tuple(enough(o, n) for o, n in zip(old, new, strict=True))
+
+
+def _with_bins(rule: RowRule, bins: int) -> RowRule:
+    """The rule with at least as many bins: further ones, empty and of no width, before the last."""
+    further = bins - rule.outlier_law.shape[-1]
+    if further <= 0:
+        return rule
+
+    def padded(x):
+        return np.insert(x, [x.shape[-1] - 1] * further, 0, axis=-1)
+
+    edges = np.pad(rule.edges_dn, [(0, 0), (0, further)], mode="edge")
+    blocks = tuple(replace(b, counts=padded(b.counts)) for b in rule.blocks)
+    return replace(rule, edges_dn=edges, outlier_law=padded(rule.outlier_law), blocks=blocks)
+
+
+def _used_bins(histograms: list[RowHistograms]) -> list[RowHistograms]:
+    """The same without the bins that no row uses, about half of them: each run of such bins is one."""
+    used = [h.counts.any((1, 2)) for h in histograms]
+    kept = [u[:, :-1] | u[:, 1:] for u in used]  # edges beside a bin that is used
+    size = round_up(max(int(k.sum(1).max()) for k in kept) + 1)
+    if size >= used[0].shape[1]:
+        return histograms
+    return [_merged(h, u, k, size) for h, u, k in zip(histograms, used, kept, strict=True)]
+
+
+def _merged(h: RowHistograms, used: np.ndarray, kept: np.ndarray, size: int) -> RowHistograms:
+    """Histograms with the edges `kept` [exposure, bin - 1] alone, and empty bins of no width before the last."""
+    counts = np.zeros((*h.counts.shape[:-1], size), h.counts.dtype)
+    edges, outliers = np.empty((len(used), size - 1)), np.zeros((len(used), size))
+    for e, keep in enumerate(kept):
+        place = np.concatenate([[0], np.cumsum(keep)])
+        place[place == place[-1]] = size - 1
+        counts[e][..., place[used[e]]] = h.counts[e][..., used[e]]
+        edges[e] = np.pad(h.edges_dn[e, keep], (0, size - 1 - keep.sum()), mode="edge")
+        np.add.at(outliers[e], place, h.outlier_law[e])
+    return replace(h, counts=counts, edges_dn=edges, outlier_law=outliers)
+
+
+def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary: Summary, margin: float):
     """Layout, scale and blocks of one channel in all exposures."""
-    histograms, sigma = summary.histograms[c], float(physics.row_sigma[c])
+    sigma = float(physics.row_sigma[c])
     electrons = physics.dark_current * summary.exposure_s + physics.read_noise**2
     # Rounding to whole counts hides gains below this one: the rows' resolution stops being proportional to beta.
     scale = np.clip(1 / (float(physics.gain[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
-    beta, table, information = (np.asarray(x) for x in _scan(physics, c, without_counts(summary), scale))
+    bins = histograms.edges_dn, histograms.outlier_law
+    beta, table, information = (np.asarray(x) for x in _scan(physics, c, without_counts(summary), *bins, scale))
     layout, counts = _sort_rows(histograms)
     low, high, peak = _reach(table, beta, counts)
     # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
@@ -85,13 +142,12 @@ def _channel_blocks(physics: Physics, c: int, summary: Summary, margin: float):
         low, high = low + np.minimum(pull, 0), high + np.maximum(pull, 0)
     low, high = np.clip(low, bottom, top), np.clip(high, bottom, top)
     span = np.arcsinh(high / scale[:, None]) - np.arcsinh(low / scale[:, None])
-    wanted = (NODES_PER_SIGMA * span / width).max(0) + 16
-    # The group of the darkest rows reaches far down and needs many nodes, the others few.
-    cuts = [slice(0, 1), slice(1, None)] if len(wanted) > SPLIT_FROM else [slice(None)]
-    blocks = [
-        Block(counts[:, cut], low[:, cut], high[:, cut], min(round_up(int(wanted[cut].max())), MOST_NODES))
-        for cut in cuts
-    ]
+    open_below, many = (low <= bottom).any(0), low.shape[1] > SPLIT_FROM
+    wanted = (NODES_PER_SIGMA * span / width).max(0) + np.where(open_below | (not many), SPARE, SPARE_OF_MANY)
+    nodes = [min(round_up(int(n), steps=4 if many else 2), MOST_NODES) for n in wanted]
+    # The groups of the darkest and of the brightest rows reach far and need many nodes, the others few.
+    cuts = [slice(0, ENDS), slice(ENDS, None)] if many else [slice(None)]
+    blocks = [Block(counts[:, c], low[:, c], high[:, c], max(nodes[c]), bool(open_below[c].any())) for c in cuts]
     return layout, scale, tuple(blocks)
 
 
@@ -105,16 +161,18 @@ def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
     rank = np.where(pixels > 0, mean, np.inf).reshape(exposures, total)  # rows that are not there come last
     order = np.full((exposures, groups * places), total)
     order[:, :total] = np.argsort(rank, axis=1, kind="stable")
-    place = np.argsort(order[:, :total], axis=1).reshape(exposures, frames, n)
+    order = np.roll(order.reshape(exposures, groups, places), 1, axis=1).reshape(exposures, -1)  # the brightest first
+    place = np.argsort(order, axis=1, kind="stable")[:, :total].reshape(exposures, frames, n)
     counts = np.zeros((exposures, groups * places, bins), histograms.counts.dtype)
     for e in range(exposures):
-        counts[e, :total] = histograms.counts[e].reshape(total, bins)[order[e, :total]]
+        filled = order[e] < total
+        counts[e, filled] = histograms.counts[e].reshape(total, bins)[order[e, filled]]
     counts = counts.reshape(exposures, groups, places, bins)
     return rows.Layout(order, place, counts.any(-1).reshape(exposures, -1)), counts
 
 
 @jax.jit
-def _scan(physics: Physics, c: int, summary: Summary, scale):
+def _scan(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law, scale):
     """On a wide grid of beta [exposure, node]: log P [exposure, node, bin], information of a pixel on asinh(beta)."""
     sigma = physics.row_sigma[c]
     top = (1 + rows.PRIOR_REACH * sigma)[None]
@@ -127,7 +185,8 @@ def _scan(physics: Physics, c: int, summary: Summary, scale):
         return beta, table, (jnp.exp(table[1:]) * slope**2).sum(-1)
 
     index = jnp.arange(len(scale))
-    at = binning(summary, dark_laws(physics, summary.exposure_s), jnp.full(len(scale), c), index)
+    laws = dark_laws(physics, summary.exposure_s)
+    at = binning(summary, laws, jnp.full(len(scale), c), index, edges_dn, outlier_law)
     return jax.lax.map(exposure, (at, jnp.asarray(scale)))
 
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.coordinates import Coordinates
-from hsnoise.maximise import Maximum, gradient_at, quasi_newton, replan
-from hsnoise.plan import plan_rules
+from hsnoise.maximise import Maximum, gradient_at, quasi_newton
+from hsnoise.plan import plan_rules, replan
 from hsnoise.statistics import Summary, without_counts
 
 WEAK = 0.12  # standard error of the log gain from which the curvature is not trusted

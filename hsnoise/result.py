@@ -83,7 +83,10 @@ class FitResult:
         with jax.enable_x64(True):
             physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self.physics)
             light = without_counts(self.summary)
-            return [jax.tree.map(np.asarray, _expected(physics, c, light)) for c in range(len(self.summary.histograms))]
+            found = (
+                _expected(physics, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
+            )
+            return [jax.tree.map(np.asarray, laws) for laws in found]
 
     def __str__(self) -> str:
         exposures = len(self.summary.exposure_s)
@@ -107,7 +110,7 @@ class FitResult:
 
 
 @jax.jit
-def _expected(physics: Physics, c: int, summary: Summary) -> tuple[jax.Array, jax.Array]:
+def _expected(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
     """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin]."""
     beta, weight = jnp.ones(1), jnp.ones(1)
     if physics.row_sigma is not None:
@@ -125,7 +128,8 @@ def _expected(physics: Physics, c: int, summary: Summary) -> tuple[jax.Array, ja
 
     exposures = len(summary.exposure_s)
     laws = dark_laws(physics, summary.exposure_s)
-    return jax.lax.map(exposure, binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures)))
+    at = binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures), edges_dn, outlier_law)
+    return jax.lax.map(exposure, at)
 
 
 def rounded(value: float, error: float) -> tuple[str, str]:

@@ -9,8 +9,6 @@ step, and is stationary at its fixed point, so that its gradient needs no deriva
 
 from __future__ import annotations
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,10 +16,12 @@ from jax.scipy.special import log_ndtr, logsumexp
 
 ITERATIONS = 80
 WHOLE_STEPS = 20  # later ones are shortened, against going round in circles
-TOLERANCE = 1e-4  # the evidence is stationary at the fixed point: its error is the square of this, a row
-MIXED, NEAR = 2, 1.0  # steps that the next one is mixed from, and the change below which they may be
-RIDGE = 1e-6
+# Steps converge quadratically: after one as long as this, in deviations of a row, a hundredth of it is left. The
+# evidence is stationary at the fixed point: its error is the square of that, a row.
+TOLERANCE = 2e-3
+GAUSSIAN_STEPS, GAUSSIAN_TOLERANCE = 12, 2e-4  # with the rows' curves as Gaussians, between two looks at them
 FAILED = 0.5  # a frame that still changes by more, in deviations of a row, has no evidence: NaN
+LEAST_SHARE, LEAST_PRECISION = 1e-9, 0.2  # of a cavity's variance, and of a row's precision, in steps of Gaussians
 FARTHEST, FARTHEST_SIGMA = 0.1, 2.0  # that a row's gain moves in one step: so far and so many of its own deviations
 PRIOR_REACH = 7.5  # standard deviations of the row gain that the nodes cover
 
@@ -30,12 +30,17 @@ class Nodes(eqx.Module):
     """Quadrature rules in beta = scale * sinh(u), u uniform: as fine as a row can resolve, at every gain.
 
     Rows are sorted into groups of similar gain, and each group has its own rule: `beta` and `log_weight` have shape
-    [group, node]. A group's first node also carries all that lies below it, where the curves are constant
-    (beta <= 0) or negligible.
+    [group, node]. Where `open_below`, a group's first node also carries all that lies below it, where the curves are
+    constant (beta <= 0); elsewhere nothing does.
     """
 
     beta: jax.Array
     log_weight: jax.Array
+    open_below: bool = eqx.field(static=True, default=True)
+
+    def in_units(self, unit) -> Nodes:
+        """The same in (beta - 1) / unit."""
+        return Nodes((self.beta - 1) / unit, self.log_weight - jnp.log(unit), self.open_below)
 
 
 class Layout(eqx.Module):
@@ -58,7 +63,7 @@ class Layout(eqx.Module):
         return x[self.place]
 
 
-def make_nodes(low, high, scale, sigma, count: int) -> Nodes:
+def make_nodes(low, high, scale, sigma, count: int, open_below: bool = True) -> Nodes:
     """`count` nodes on [low, high] [group], cut to what a prior Normal(1, sigma^2) reaches; scale is one number."""
     low = jnp.maximum(jnp.maximum(low, 1 - PRIOR_REACH * sigma), 0.0)
     high = jnp.maximum(jnp.minimum(high, 1 + PRIOR_REACH * sigma), low * (1 + 1e-9) + 1e-9)
@@ -69,7 +74,7 @@ def make_nodes(low, high, scale, sigma, count: int) -> Nodes:
     ends = jnp.array([3 / 8, 7 / 6, 23 / 24])
     weight = jnp.ones(count).at[:3].set(ends).at[-3:].set(ends[::-1])
     log_weight = jnp.log(weight)[None, :] + jnp.log(step * scale)[:, None] + jnp.log(jnp.cosh(u))
-    return jax.lax.stop_gradient(Nodes(scale * jnp.sinh(u), log_weight))
+    return jax.lax.stop_gradient(Nodes(scale * jnp.sinh(u), log_weight, open_below))
 
 
 def _tail(nodes: Nodes, mean, variance):
@@ -88,6 +93,20 @@ def _log_weights(curves, nodes: Nodes, mean, variance):
     return curves + prior + nodes.log_weight[:, None, :]
 
 
+@jax.custom_jvp
+def _log_sum_exp(logs):
+    """Over the nodes. Its derivative's weights are in float32: shares of a row, of which there are many."""
+    return logsumexp(logs, axis=-1)
+
+
+@_log_sum_exp.defjvp
+def _log_sum_exp_jvp(primals, tangents):
+    (logs,), (change,) = primals, tangents
+    total = _log_sum_exp(logs)
+    share = jnp.exp((logs - total[..., None]).astype(jnp.float32))
+    return total, (share.astype(logs.dtype) * change).sum(-1)
+
+
 def log_evidence(curves, nodes: Nodes, mean, variance):
     """log of the integral of exp(curve) Normal(beta; mean, variance) for each row [group, row].
 
@@ -95,29 +114,31 @@ def log_evidence(curves, nodes: Nodes, mean, variance):
     """
     mean = jnp.broadcast_to(mean, curves.shape[:-1])
     variance = jnp.broadcast_to(variance, curves.shape[:-1])
-    log_mass, _, _ = _tail(nodes, mean, variance)
-    body = logsumexp(_log_weights(curves, nodes, mean, variance), axis=-1)
-    return jnp.logaddexp(body, curves[..., 0] + log_mass)
+    body = _log_sum_exp(_log_weights(curves, nodes, mean, variance))
+    return jnp.logaddexp(body, curves[..., 0] + _tail(nodes, mean, variance)[0]) if nodes.open_below else body
 
 
 def _posterior(curves, nodes: Nodes, mean, variance):
     """Mean and variance of beta for each row under Normal(mean, variance) x exp(curve)."""
-    log_mass, tail_mean, tail_square = _tail(nodes, mean, variance)
     logs = _log_weights(curves, nodes, mean, variance)
-    tail = curves[..., 0] + log_mass
-    top = jnp.maximum(logs.max(-1), tail)
+    top = logs.max(-1)
+    if nodes.open_below:
+        log_mass, tail_mean, tail_square = _tail(nodes, mean, variance)
+        tail = curves[..., 0] + log_mass
+        top = jnp.maximum(top, tail)
     w = jnp.exp(logs - top[..., None])
-    w_tail = jnp.exp(tail - top)
     # Moments about the middle of the nodes, near which all rows of a group lie; one product reads the weights once.
     middle = nodes.beta.mean(-1, keepdims=True)
     offset = nodes.beta - middle
     powers = jnp.stack([jnp.ones_like(offset), offset, offset**2], axis=-1)
-    sums = jnp.einsum("grn,gnk->grk", w, powers)
-    shift = mean - middle
-    total = sums[..., 0] + w_tail
-    first = (sums[..., 1] + w_tail * (tail_mean + shift)) / total
-    second = (sums[..., 2] + w_tail * (tail_square + 2 * shift * tail_mean + shift**2)) / total
-    return middle + first, second - first**2
+    total, first, second = jnp.moveaxis(jnp.einsum("grn,gnk->grk", w, powers), -1, 0)
+    if nodes.open_below:
+        w_tail, shift = jnp.exp(tail - top), mean - middle
+        total += w_tail
+        first += w_tail * (tail_mean + shift)
+        second += w_tail * (tail_square + 2 * shift * tail_mean + shift**2)
+    first = first / total
+    return middle + first, second / total - first**2
 
 
 class Curves(eqx.Module):
@@ -148,9 +169,9 @@ class Curves(eqx.Module):
         m, v = self.each(_posterior, mean, variance)
         return jnp.where(self.layout.filled, m, mean), jnp.where(self.layout.filled, v, variance)
 
-    def in_float32(self) -> Curves:
-        """The same up to a constant for each row, which a posterior does not depend on."""
-        blocks = [(curves - curves.max(-1, keepdims=True), nodes) for curves, nodes in self.blocks]
+    def in_float32(self, unit) -> Curves:
+        """Rows in (beta - 1) / unit, and up to a constant for each row, which a posterior does not depend on."""
+        blocks = [(curves - curves.max(-1, keepdims=True), nodes.in_units(unit)) for curves, nodes in self.blocks]
         return Curves(jax.tree.map(lambda x: x.astype(jnp.float32), tuple(blocks)), self.layout)
 
 
@@ -178,105 +199,101 @@ def log_evidence_coloured(rows: Curves, spectrum):
     Returns [frame]; NaN where no fixed point is found, for rows that contradict the prior beyond measure.
     """
     fixed = jax.lax.stop_gradient
-    layout, spectrum = rows.layout, spectrum[None, :]
-    change, site, cavity = _consistent(fixed(rows), fixed(spectrum))
-    (a, precision), (mean, variance) = fixed(site), fixed(cavity)
-    gain = spectrum / (1 + precision[:, None] * spectrum)
-    field = jnp.fft.fft(a - precision[:, None], axis=-1, norm="ortho")
-    log_prior = (
-        a.sum(-1)
-        - 0.5 * precision * a.shape[-1]
-        - 0.5 * jnp.log1p(precision[:, None] * spectrum).sum(-1)
-        + 0.5 * (jnp.abs(field) ** 2 * gain).sum(-1)
-    )
+    unit = fixed(jnp.sqrt(spectrum.mean()))  # all below is in deviations of the prior from 1
+    layout, spectrum = rows.layout, spectrum / unit**2
+    found = _consistent(fixed(rows).in_float32(unit), fixed(spectrum).astype(jnp.float32), FARTHEST / unit)
+    change, (a, precision), (mean, variance) = jax.tree.map(lambda x: x.astype(spectrum.dtype), found)
     wide = jnp.broadcast_to(variance[:, None], mean.shape)
-    evidence = layout.framed(rows.log_evidence(layout.grouped(mean), layout.grouped(wide)))
+    gain = spectrum[None, :] / (1 + precision[:, None] * spectrum[None, :])
+    field = jnp.fft.fft(a, axis=-1, norm="ortho")
+    log_prior = 0.5 * (jnp.abs(field) ** 2 * gain - jnp.log1p(precision[:, None] * spectrum[None, :])).sum(-1)
+    evidence = layout.framed(rows.log_evidence(layout.grouped(1 + unit * mean), layout.grouped(unit**2 * wide)))
     log_rows = evidence + 0.5 * jnp.log(2 * jnp.pi * wide) + 0.5 * mean**2 / wide
     both = 1 / (precision + 1 / variance)
     log_both = 0.5 * jnp.log(2 * jnp.pi * both)[:, None] + 0.5 * both[:, None] * (a + mean / wide) ** 2
     return jnp.where(change < FAILED, log_prior + log_rows.sum(-1) - log_both.sum(-1), jnp.nan)
 
 
-def _consistent(rows: Curves, spectrum):
+def _consistent(rows: Curves, spectrum, farthest):
     """Fixed point: last change, sites (a, precision) of the rows, cavity Normal(mean, variance) that each row sees.
 
-    a and mean are [frame, row], change, precision and variance [frame]; spectrum [1, row].
+    a and mean are [frame, row], change, precision and variance [frame]; spectrum [row]. In float32, as `rows` are.
     """
-    ones = jnp.ones(rows.layout.place.shape, spectrum.dtype)
-    start = (ones, ones[:, 0]), (ones, jnp.broadcast_to(spectrum.mean(), ones[:, 0].shape))
-    far = jnp.full_like(ones[:, 0], jnp.inf)
+    farthest = farthest.astype(spectrum.dtype)
+    zeros = jnp.zeros(rows.layout.place.shape, spectrum.dtype)
+    ones = jnp.ones_like(zeros[:, 0])
 
-    def iterate(rows: Curves, spectrum, start, change):
-        def step(state):
-            count, change, _, _, (mean, variance), before = state
-            # The longer it takes, the shorter the steps.
-            found = _step(rows, spectrum, mean, variance, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)))
-            ahead, before = _ahead((mean, variance), found[2], found[0], change, before)
-            return count + 1, *found, ahead, before
+    def step(state):
+        count, _, _, cavity = state
+        # The longer it takes, the shorter the steps.
+        return count + 1, *_step(rows, spectrum, cavity, jnp.minimum(1.0, WHOLE_STEPS / (count + 1)), farthest)
 
-        def going(state):
-            return (state[0] < ITERATIONS) & (state[1].max() > TOLERANCE)
+    def going(state):
+        return (state[0] < ITERATIONS) & (state[1].max() > TOLERANCE)
 
-        mean, variance = start[1]
-        nothing = jnp.zeros((MIXED, len(mean), mean.shape[1] + 1), mean.dtype)
-        history = nothing, nothing, jnp.full((MIXED, len(mean)), jnp.inf, mean.dtype)
-        return jax.lax.while_loop(going, step, (0, change, *start, start[1], history))[1:4]
-
-    # In float32, several times as fast; where that fails, float64 goes all of the way.
-    narrow = partial(jax.tree.map, lambda x: x.astype(jnp.float32))
-    near = iterate(rows.in_float32(), narrow(spectrum), narrow(start), narrow(far))
-    sound = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(near)]).all()
-    change, *state = jax.tree.map(lambda x, y: jnp.where(sound, x.astype(y.dtype), y), near, (far, *start))
-    return iterate(rows, spectrum, tuple(state), change)
+    start = 0, jnp.inf * ones, (zeros, ones), (zeros, spectrum.mean() * ones)
+    return jax.lax.while_loop(going, step, start)[1:]
 
 
-def _ahead(at, cavity, change, change_before, before):
-    """Where the next step begins, and what later steps need to know of this one.
+def _step(rows: Curves, spectrum, cavity, most, farthest):
+    """One step towards the fixed point from a cavity, `most` of the way: (largest change [frame], site, cavity).
 
-    Anderson's mixing (J. ACM 12, 1965) of the last steps: the combination of them that leaves least to go, in half as
-    many steps. Frames that are far from the end, or came no nearer, just go on from their cavity.
+    Near the cavity a row's curve does what the Gaussian with its posterior does. The fixed point of these Gaussians
+    costs no look at the curves, and is where the step leads.
     """
-    (mean, variance), deviation = cavity, jnp.sqrt(cavity[1])[:, None]
-    told = jnp.concatenate([mean, jnp.log(variance)[:, None]], axis=1)
-    off_variance = jnp.log(variance / at[1])[:, None] * jnp.sqrt(mean.shape[1])
-    off = jnp.concatenate([(mean - at[0]) / deviation, off_variance], axis=1)
-    told_before, off_before, changes = before
-    useful = (changes < NEAR) & (change < change_before)[None, :]
-    d_told, d_off = (
-        jnp.where(useful[..., None], now[None] - then, 0.0) for now, then in ((told, told_before), (off, off_before))
-    )
-    square = jnp.einsum("ifn,jfn->fij", d_off, d_off)
-    ridge = RIDGE * jnp.trace(square, axis1=1, axis2=2) + jnp.finfo(mean.dtype).tiny
-    along = jnp.einsum("ifn,fn->fi", d_off, off)
-    share = jnp.linalg.solve(square + ridge[:, None, None] * jnp.eye(MIXED, dtype=mean.dtype)[None], along[..., None])
-    ahead = told - jnp.einsum("fi,ifn->fn", share[..., 0], d_told)
-    history = zip((told, off, change), before, strict=True)
-    return (ahead[:, :-1], jnp.exp(ahead[:, -1])), tuple(jnp.concatenate([new[None], old[:-1]]) for new, old in history)
-
-
-def _step(rows: Curves, spectrum, mean, variance, most):
-    """One step towards the fixed point from a cavity, `most` of the way: (largest change [frame], site, cavity)."""
-    layout = rows.layout
+    layout, (mean, variance) = rows.layout, cavity
     wide = jnp.broadcast_to(variance[:, None], mean.shape)
-    dtype = rows.blocks[0][0].dtype
-    posterior = rows.posterior(layout.grouped(mean).astype(dtype), layout.grouped(wide).astype(dtype))
-    m, v = (layout.framed(x).astype(mean.dtype) for x in posterior)
-    spread = v.mean(-1)
-    precision = jnp.maximum(1 / spread - 1 / variance, 1e-12)
-    a = m / spread[:, None] - mean / wide
-    gain = spectrum / (1 + precision[:, None] * spectrum)
-    x = jnp.fft.ifft(gain * jnp.fft.fft(a - precision[:, None], axis=-1), axis=-1).real
-    both = gain.mean(-1)
-    # Cavities in natural parameters. Where rows and prior disagree, curves are not Gaussian over the whole way between:
-    # no row moves further at once than a Gaussian stands for it.
-    share = (1 / both - precision) - 1 / variance
-    pull = ((1 + x) / both[:, None] - a) - mean / wide
-    far = jnp.abs(pull - share[:, None] * m) * v / (FARTHEST + FARTHEST_SIGMA * jnp.sqrt(v))
+    m, v = (layout.framed(x) for x in rows.posterior(layout.grouped(mean), layout.grouped(wide)))
+    v = jnp.maximum(v, LEAST_SHARE * wide)
+    precision, pull = 1 / v - 1 / wide, m / v - mean / wide
+
+    def of_gaussians(cavity):
+        mean, variance = cavity
+        both = jnp.maximum(precision + 1 / variance[:, None], LEAST_PRECISION / v)
+        return (pull + mean / variance[:, None]) / both, 1 / both
+
+    def gaussian_step(state):
+        count, _, cavity, posterior = state
+        ahead = _cavity(_site(posterior, cavity), spectrum)
+        return count + 1, _change(cavity, ahead, v).max(), ahead, of_gaussians(ahead)
+
+    def going(state):
+        return (state[0] < GAUSSIAN_STEPS) & (state[1] > GAUSSIAN_TOLERANCE)
+
+    ahead = jax.lax.while_loop(going, gaussian_step, (0, jnp.inf * v[0, 0], cavity, (m, v)))[2]
+    # Where rows and prior disagree, curves are not Gaussian over the whole way between: no row moves further at once
+    # than a Gaussian stands for it. Cavities in natural parameters.
+    share = 1 / ahead[1] - 1 / variance
+    to_go = ahead[0] / ahead[1][:, None] - mean / wide
+    far = jnp.abs(to_go - share[:, None] * m) * v / (farthest + FARTHEST_SIGMA * jnp.sqrt(v))
     part = most / jnp.maximum(far.max(-1), 1.0)
     new_variance = 1 / (1 / variance + part * share)
-    new_mean = new_variance[:, None] * (mean / wide + part[:, None] * pull)
-    change = jnp.maximum(
-        jnp.abs(jnp.log(new_variance / variance)),
-        (jnp.abs(new_mean - mean) / jnp.sqrt(new_variance)[:, None]).max(-1),
-    )
-    return change, (a, precision), (new_mean, new_variance)
+    new = new_variance[:, None] * (mean / wide + part[:, None] * to_go), new_variance
+    return _change(cavity, new, v), _site(of_gaussians(new), new), new
+
+
+def _change(cavity, ahead, v):
+    """The largest change of a row [frame], in deviations of its posterior, which moves by its cavity's share in it."""
+    (mean, variance), (new_mean, new_variance) = cavity, ahead
+    moved = (jnp.abs(new_mean - mean) / jnp.sqrt(new_variance)[:, None]).max(-1)
+    share = jnp.sqrt(jnp.minimum(v.mean(-1) / new_variance, 1.0))
+    return share * jnp.maximum(jnp.abs(jnp.log(new_variance / variance)), moved)
+
+
+def _site(posterior, cavity):
+    """What the rows add to their cavities: (a, precision) of exp(a x - precision x^2 / 2), one precision a frame."""
+    (m, v), (mean, variance) = posterior, cavity
+    spread = v.mean(-1)
+    precision = jnp.maximum(1 / spread - 1 / variance, 1e-12)
+    return m / spread[:, None] - mean / variance[:, None], precision
+
+
+def _cavity(site, spectrum):
+    """What a row's neighbours and the prior tell of it, Normal(mean, variance), under the sites of all rows."""
+    a, precision = site
+    gain = spectrum[None, :] / (1 + precision[:, None] * spectrum[None, :])
+    half = gain[:, : gain.shape[1] // 2 + 1]
+    x = jnp.fft.irfft(half * jnp.fft.rfft(a, axis=-1), n=a.shape[1], axis=-1)
+    both = gain.mean(-1)
+    variance = 1 / (1 / both - precision)
+    return variance[:, None] * (x / both[:, None] - a), variance

@@ -98,10 +98,10 @@ def channel_rows(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
     return rows
 
 
-def round_up(size: int) -> int:
-    """The next of few sizes (16, 24, 32, 48, 64, 96 ...), so that captures alike share compiled programs."""
+def round_up(size: int, steps: int = 2) -> int:
+    """The next of few sizes, `steps` to each doubling (16, 24, 32, 48 ...), so that captures alike share programs."""
     power = 1 << max(size - 1, 31).bit_length() - 1
-    return next(n for n in (power, power * 3 // 2, power * 2) if n >= size)
+    return next(n for n in range(power, 2 * power + 1, power // steps) if n >= size)
 
 
 def row_stride(cfa: str, channel: str) -> int:

@@ -20,11 +20,11 @@ from hsnoise._types import unit_in_words
 from hsnoise.coordinates import Coordinates, coordinates_for
 from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_variance, part_of, share_of_far
 from hsnoise.knobs import Knob, knobs
-from hsnoise.maximise import gradient_at, replan
+from hsnoise.maximise import gradient_at
 from hsnoise.model import NoiseModel
 from hsnoise.notes import near_zero, parameter_notes
 from hsnoise.physics import Physics, physics_of
-from hsnoise.plan import plan_rules
+from hsnoise.plan import plan_rules, replan
 from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import FrameStack
 from hsnoise.statistics import coding_of, summarise, without_counts
