@@ -7,7 +7,7 @@ import jax
 
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Rules, evaluate, physics_of
-from hsnoise.plan import plan_rules
+from hsnoise.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, summarise, without_counts
 
@@ -31,5 +31,5 @@ def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **k
         raise ValueError(f"params: shutter {params.shutter!r}, but the stack's is {summary.shutter!r}")
     with jax.enable_x64(True):
         physics = physics_of(params)
-        rules = plan_rules(physics, summary) if rules is None else rules
+        rules = plan_rules(physics, summary, CLOSE_MARGIN) if rules is None else rules
         return _evaluate(physics, without_counts(summary), rules)  # the rules hold the counts

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._compiling import jit_lean
 from hsnoise.coordinates import Coordinates
 from hsnoise.physics import Physics, Rules, evaluate
-from hsnoise.plan import plan_rules, replan
+from hsnoise.plan import CLOSE_MARGIN, plan_rules, replan
 from hsnoise.statistics import Summary, every_nth_row, some_frames, without_counts
 
 ROUNDS = 16
@@ -23,7 +24,7 @@ CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many 
 FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
 MANY_ROWS, PILOT_ROWS = 30_000, 3_000
 FAR_OFF = 1e12  # loss where a step must not end
-CHORDS, PIECE_MARGIN = 12, 1.1
+CHORDS = 12
 CHORD_CLOSE_SIGMA = 0.1  # with the curvature of a part of the frames
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
 REFINEMENTS = 4  # of the curvature
@@ -130,7 +131,7 @@ def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple
     channels = range(len(summary.channels))
     light = without_counts(replace(summary, flats=None))
     parts = (some_frames(summary, start, start + frames) for start in range(0, max(summary.n_frames), frames))
-    rules = [[plan_rules(physics, part, PIECE_MARGIN, channel=c) for c in channels] for part in parts]
+    rules = [[plan_rules(physics, part, CLOSE_MARGIN, channel=c) for c in channels] for part in parts]
     # Channels of one stride share a program, too.
     strides = [h.row_stride for h in summary.histograms]
     most = {
@@ -228,7 +229,7 @@ def gradient_at(coordinates, vector, summary, rules):
     return tuple(map(sum, zip(*parts, strict=True)))
 
 
-@eqx.filter_jit
+@jit_lean
 def likelihood_at(coordinates, vector, summary, rules):
     """Log-likelihood and its gradient."""
     return jax.value_and_grad(lambda at: evaluate(coordinates.physics(at), summary, rules))(vector)

@@ -18,7 +18,8 @@ from hsnoise.statistics import RowHistograms, Summary, round_up, without_counts
 
 SCAN_NODES = 256
 KEEP_NATS = 25.0  # a node where every row of a group is this far below its best is left out
-MARGIN = 1.35  # in beta on either side, so that the parameters may move during a fit
+# In beta on either side: so that the parameters may move during a fit, and where they are almost known.
+MARGIN, CLOSE_MARGIN = 1.35, 1.1
 EXTREME_ROWS = 6
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
@@ -30,12 +31,13 @@ GROUP_ROWS, MOST_GROUPS, SPLIT_FROM, ENDS = 192, 24, 8, 3
 def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN, channel: int | None = None) -> Rules:
     """Quadrature rules for the rows at `physics` (at the moment estimates while `physics` is traced).
 
-    margin: in beta, on either side of where the rows are now. channel: of that channel only.
+    margin: in beta, on either side of where the rows are now (at least MARGIN while it is traced). channel: of that
+        channel only.
     """
     if not summary.histograms:
         return ()
     if any(map(is_traced, jax.tree.leaves(physics))):
-        physics = start_physics(summary, with_row_gain=physics.row_sigma is not None)
+        physics, margin = start_physics(summary, with_row_gain=physics.row_sigma is not None), max(margin, MARGIN)
     channels = range(len(summary.histograms)) if channel is None else [channel]
     alike = [
         [c for c in channels if summary.histograms[c].row_stride == stride]

@@ -10,6 +10,8 @@ import pytest
 from scipy import stats
 
 import hsnoise
+from hsnoise import plan
+from hsnoise._compiling import _lean_options, jit_lean
 from hsnoise.model import sample_dark
 from hsnoise.physics import evaluate, physics_of
 from hsnoise.plan import plan_rules
@@ -152,6 +154,30 @@ def test_jit_vmap_and_a_float32_session_give_the_same():
     assert all(np.isfinite(np.asarray(g)).all() for g in jax.tree.leaves(gradient))
 
 
+@pytest.mark.parametrize("row_gain", [True, False])
+def test_bins_that_no_row_uses_make_no_difference(row_gain, monkeypatch):
+    """Left out by `plan_rules`, or put in again by `replan`; hot pixels are far out, in the last, open bin, too."""
+    model = camera(shutter="global", black_level_dn=40.0)
+    stack = capture(model, shape=(32, 64))
+    frames = [np.stack(list(stack.frames(e))) for e in range(len(stack.exposure_s))]
+    frames[1][0, 3, ::16] = [90, 300, 5000, 16000]
+    model = model if row_gain else model.remove("row_gain")
+    summary = hsnoise.summarise(hsnoise.FrameStack(frames, EXPOSURE_S, black_level=40, cfa="RGGB", shutter="global"))
+    physics = physics_of(model)
+    value = jax.jit(lambda p, rules: evaluate(p, summary, rules))
+    fewer = plan_rules(physics, summary)
+    monkeypatch.setattr(plan, "_used_bins", lambda histograms: histograms)
+    all_bins = plan_rules(physics, summary)
+    assert fewer[0].outlier_law.shape[-1] < all_bins[0].outlier_law.shape[-1]
+    padded = plan.replan(all_bins, fewer)
+    assert padded[0].outlier_law.shape == all_bins[0].outlier_law.shape
+    for outliers in (None, jnp.full(2, 1e-3)):
+        at = eqx.tree_at(lambda p: p.outliers, physics, outliers, is_leaf=lambda x: x is None)
+        expected = float(value(at, all_bins))
+        for rules in (fewer, padded):
+            np.testing.assert_allclose(float(value(at, rules)), expected, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_rules_hold_away_from_where_they_were_made():
     """A rule made at the truth is still exact where a fit may wander; finer rules change nothing."""
@@ -211,3 +237,9 @@ def test_known_photons_of_flats_tell_the_gain():
 def test_a_model_of_another_sensor_is_refused(model, message):
     with pytest.raises(ValueError, match=message):
         hsnoise.log_likelihood(model, capture(camera(black_level_dn=10.0)))
+
+
+def test_programs_of_fits_are_compiled_lean():
+    assert _lean_options(), "this version of XLA does not know the option: fits compile twice as long"
+    square = jit_lean(lambda x, power: x**power)
+    assert square(3.0, 2) == 9.0 and square(jnp.arange(3.0), 2)[2] == 4.0
