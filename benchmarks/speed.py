@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from math import isqrt
 from pathlib import Path
 
 import equinox as eqx
@@ -209,17 +210,43 @@ def fit(rounds: int) -> list[Line]:
 def growth(rounds: int) -> list[Line]:
     """Slopes of log time against log size."""
     camera, key = model(), jax.random.key(0)
-    sides, seconds = (256, 512, 1024, 2048), []
-    for side in sides:
-        times = medians({"": lambda side=side: hsnoise.sample_dark(key, 4, (side, side), camera)}, rounds)
-        seconds.append(times[""])
-    lines = [Line("growth", "sampling against pixels", "hsnoise.sample", slope_of(np.square(sides), seconds), "slope")]
-    seconds = []
-    for side in sides[:3]:
-        stack = dark_stack(2, (side, side))
-        seconds.append(medians({"": lambda stack=stack: summarise(stack).exposure_s}, rounds)[""])
-    slope = slope_of(np.square(sides[:3]), seconds)
-    return [*lines, Line("growth", "row histograms against pixels", "hsnoise.summarise", slope, "slope")]
+
+    def slope(what: str, who: str, sizes, prepare: Callable, run: Callable) -> Line:
+        seconds = []
+        for size in sizes:
+            ready = prepare(size)
+            seconds.append(medians({who: lambda ready=ready: run(ready)}, rounds)[who])
+        return Line("growth", what, who, slope_of(sizes, seconds), "slope")
+
+    def draw(side: int):
+        return hsnoise.sample_dark(key, 4, (side, side), camera)
+
+    def square(pixels: int) -> hsnoise.FrameStack:
+        return dark_stack(2, (isqrt(pixels), isqrt(pixels)))
+
+    def read(stack: hsnoise.FrameStack):
+        return summarise(stack).exposure_s
+
+    def fitted(summary):
+        return hsnoise.fit(summary).covariance
+
+    pixels = tuple(side**2 for side in (256, 512, 1024, 2048))
+    lines = [slope("sampling against pixels", "hsnoise.sample", pixels, isqrt, draw)]
+    captures = {
+        "pixels": (pixels[:3], square),
+        "frames": ((2, 4, 8), lambda n: dark_stack(n, (512, 512))),
+        "exposures": ((2, 4, 8), lambda n: dark_stack(2, (512, 512), n)),
+    }
+    for what, (sizes, make) in captures.items():
+        lines.append(slope(f"row histograms against {what}", "hsnoise.summarise", sizes, make, read))
+    captures = {
+        "columns": ((120, 240, 480), lambda n: summarise(dark_stack(8, (160, n)))),
+        "frames": ((4, 8, 16), lambda n: summarise(dark_stack(n, (160, 240)))),
+        "exposures": ((2, 4, 8), lambda n: summarise(dark_stack(8, (160, 240), n))),
+    }
+    for what, (sizes, make) in captures.items():
+        lines.append(slope(f"fit after the histograms against {what}", "hsnoise.fit", sizes, make, fitted))
+    return lines
 
 
 def diagnose(rounds: int) -> list[Line]:

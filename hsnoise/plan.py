@@ -19,13 +19,13 @@ from hsnoise.statistics import RowHistograms, Summary, round_up, without_counts
 SCAN_NODES = 256
 KEEP_NATS = 25.0  # a node where every row of a group is this far below its best is left out
 # In beta on either side: so that the parameters may move during a fit, and where they are almost known.
-MARGIN, CLOSE_MARGIN = 1.35, 1.1
+MARGIN, CLOSE_MARGIN = 1.35, 1.05
 EXTREME_ROWS = 6
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
 # Further nodes: where the integrand ends at a gain of zero, or each of few rows counts; and where errors average out.
 SPARE, SPARE_OF_MANY = 16, 4
-GROUP_ROWS, MOST_GROUPS, SPLIT_FROM, ENDS = 192, 24, 8, 3
+GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
 
 
 def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN, channel: int | None = None) -> Rules:
@@ -147,8 +147,8 @@ def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary
     open_below, many = (low <= bottom).any(0), low.shape[1] > SPLIT_FROM
     wanted = (NODES_PER_SIGMA * span / width).max(0) + np.where(open_below | (not many), SPARE, SPARE_OF_MANY)
     nodes = [min(round_up(int(n), steps=4 if many else 2), MOST_NODES) for n in wanted]
-    # The groups of the darkest and of the brightest rows reach far and need many nodes, the others few.
-    cuts = [slice(0, ENDS), slice(ENDS, None)] if many else [slice(None)]
+    # The darkest rows reach far and need many nodes, the brightest and those next to the darkest some, the others few.
+    cuts = [slice(0, 1), slice(1, 3), slice(3, None)] if many else [slice(None)]
     blocks = [Block(counts[:, c], low[:, c], high[:, c], max(nodes[c]), bool(open_below[c].any())) for c in cuts]
     return layout, scale, tuple(blocks)
 
@@ -163,7 +163,9 @@ def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
     rank = np.where(pixels > 0, mean, np.inf).reshape(exposures, total)  # rows that are not there come last
     order = np.full((exposures, groups * places), total)
     order[:, :total] = np.argsort(rank, axis=1, kind="stable")
-    order = np.roll(order.reshape(exposures, groups, places), 1, axis=1).reshape(exposures, -1)  # the brightest first
+    # The darkest, the brightest, then all between: those at the ends need rules of their own.
+    ends_first = np.r_[0, groups - 1, 1 : groups - 1][:groups]
+    order = order.reshape(exposures, groups, places)[:, ends_first].reshape(exposures, -1)
     place = np.argsort(order, axis=1, kind="stable")[:, :total].reshape(exposures, frames, n)
     counts = np.zeros((exposures, groups * places, bins), histograms.counts.dtype)
     for e in range(exposures):
