@@ -320,7 +320,7 @@ def checked_light(clean, cfa: str):
     some = clean if isinstance(clean, jax.Array) else clean[tuple(slice(1 if s == 0 else None) for s in clean.strides)]
     with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
         low, high = float(some.min()), float(some.max())
-    if not (low >= 0 and high < np.inf):
+    if not (low >= 0 and high <= float(np.finfo(np.float32).max)):
         raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
     return clean, low, high
 

@@ -102,10 +102,15 @@ def _used_bins(histograms: list[RowHistograms]) -> list[RowHistograms]:
     """The same without the bins that no row uses, about half of them: each run of such bins is one."""
     used = [h.counts.any((1, 2)) for h in histograms]
     kept = [u[:, :-1] | u[:, 1:] for u in used]  # edges beside a bin that is used
-    size = round_up(max(int(k.sum(1).max()) for k in kept) + 1)
+    size = round_up(max(int(k.sum(1).max()) for k in kept) + 1, steps=2 if _has_many_rows(histograms[0]) else 1)
     if size >= used[0].shape[1]:
         return histograms
     return [_merged(h, u, k, size) for h, u, k in zip(histograms, used, kept, strict=True)]
+
+
+def _has_many_rows(h: RowHistograms) -> bool:
+    """Whether evaluating costs more than compiling. If not, sizes are coarse, so that captures share programs."""
+    return h.counts[0, ..., 0].size >= GROUP_ROWS * SPLIT_FROM
 
 
 def _merged(h: RowHistograms, used: np.ndarray, kept: np.ndarray, size: int) -> RowHistograms:
@@ -144,9 +149,10 @@ def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary
         low, high = low + np.minimum(pull, 0), high + np.maximum(pull, 0)
     low, high = np.clip(low, bottom, top), np.clip(high, bottom, top)
     span = np.arcsinh(high / scale[:, None]) - np.arcsinh(low / scale[:, None])
-    open_below, many = (low <= bottom).any(0), low.shape[1] > SPLIT_FROM
-    wanted = (NODES_PER_SIGMA * span / width).max(0) + np.where(open_below | (not many), SPARE, SPARE_OF_MANY)
-    nodes = [min(round_up(int(n), steps=4 if many else 2), MOST_NODES) for n in wanted]
+    many = _has_many_rows(histograms)
+    open_below = (low <= bottom).any(0) | (not many)
+    wanted = (NODES_PER_SIGMA * span / width).max(0) + np.where(open_below, SPARE, SPARE_OF_MANY)
+    nodes = [min(round_up(int(n), steps=4 if many else 1), MOST_NODES) for n in wanted]
     # The darkest rows reach far and need many nodes, the brightest and those next to the darkest some, the others few.
     cuts = [slice(0, 1), slice(1, 3), slice(3, None)] if many else [slice(None)]
     blocks = [Block(counts[:, c], low[:, c], high[:, c], max(nodes[c]), bool(open_below[c].any())) for c in cuts]

@@ -347,11 +347,15 @@ def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
 
 @contextmanager
 def _cluster_watched(name: str) -> Iterator[None]:
-    """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`."""
+    """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`.
+
+    Other errors pass, those of whoever reads the chunks, say; a note says at which frame.
+    """
     try:
         yield
     except Exception as error:
         if type(error).__module__.partition(".")[0] != "distributed":  # which is imported only by those who use it
+            error.add_note(f"{name}: this frame, or one of the next, could not be read")
             raise
         raise RuntimeError(
             f"{name}: the cluster was lost that this frame, or some after it, was read on ({type(error).__name__});"

@@ -135,3 +135,16 @@ def test_bad_frame_is_named(counts):
     bad[1, 7, 3, 3] = np.nan
     with pytest.raises(ValueError, match=r"frame 7 of (dark )?exposure 1"):
         summarise(hsnoise.FrameStack(da.from_array(bad, chunks=(1, 1, 64, 96)), **CAPTURE))
+
+
+def test_a_chunk_that_cannot_be_read_says_where(counts):
+    def gone(block, block_info=None):
+        if block_info[0]["chunk-location"][0] == 1:
+            raise OSError("disk on fire")
+        return block
+
+    lazy = da.from_array(counts, chunks=(1, 4, 64, 96)).map_blocks(gone, meta=counts[:0])
+    stack = hsnoise.FrameStack(lazy, **CAPTURE)
+    with pytest.raises(OSError, match="disk on fire") as told:
+        summarise(stack)
+    assert "exposure 1" in " ".join(told.value.__notes__)

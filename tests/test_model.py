@@ -300,6 +300,7 @@ def test_a_file_that_is_no_json_is_refused(tmp_path):
         (np.full((1, 4, 4), -1.0), "clean: expected finite photoelectrons >= 0"),
         (np.full((1, 4, 4), np.nan), "clean: expected finite photoelectrons >= 0"),
         (np.full((1, 4, 4), np.inf), "clean: expected finite photoelectrons >= 0"),
+        (np.full((1, 4, 4), 1e39), "clean: expected finite photoelectrons >= 0"),  # infinite in float32
         (np.ones(4), r"clean: expected photoelectrons \[..., row, column\]"),
         (np.ones((0, 4, 4)), r"clean: expected photoelectrons \[..., row, column\]"),
         (np.ones((3, 4)), "clean: expected even rows and columns"),
