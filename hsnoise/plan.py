@@ -152,7 +152,7 @@ def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary
     many = _has_many_rows(histograms)
     open_below = (low <= bottom).any(0) | (not many)
     wanted = (NODES_PER_SIGMA * span / width).max(0) + np.where(open_below, SPARE, SPARE_OF_MANY)
-    nodes = [min(round_up(int(n), steps=4 if many else 1), MOST_NODES) for n in wanted]
+    nodes = [min(round_up(int(n), steps=8 if many else 1), MOST_NODES) for n in wanted]
     # The darkest rows reach far and need many nodes, the brightest and those next to the darkest some, the others few.
     cuts = [slice(0, 1), slice(1, 3), slice(3, None)] if many else [slice(None)]
     blocks = [Block(counts[:, c], low[:, c], high[:, c], max(nodes[c]), bool(open_below[c].any())) for c in cuts]
