@@ -239,12 +239,12 @@ def growth(rounds: int) -> list[Line]:
     }
     for what, (sizes, make) in captures.items():
         lines.append(slope(f"row histograms against {what}", "hsnoise.summarise", sizes, make, read))
-    captures = {
+    summaries = {
         "columns": ((120, 240, 480), lambda n: summarise(dark_stack(8, (160, n)))),
         "frames": ((4, 8, 16), lambda n: summarise(dark_stack(n, (160, 240)))),
         "exposures": ((2, 4, 8), lambda n: summarise(dark_stack(8, (160, 240), n))),
     }
-    for what, (sizes, make) in captures.items():
+    for what, (sizes, make) in summaries.items():
         lines.append(slope(f"fit after the histograms against {what}", "hsnoise.fit", sizes, make, fitted))
     return lines
 

@@ -24,7 +24,7 @@ def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **k
     the expectation-consistent approximation (rows.py), white rows exactly, all within 7.5 deviations of the row gain
     and, while the model is traced, near the estimates from moments: a model that is thousands of nats from the capture
     is judged too low. NaN where coloured rows contradict a model so far that their gains have no common fixed point
-    (a dark current of a third or three times the capture's, say). Raises ValueError if the model's
+    (a dark current of a tenth or four times the capture's, say). Raises ValueError if the model's
     channels or shutter are not the stack's, or if it holds effects without a likelihood.
     """
     summary = stack if isinstance(stack, Summary) else summarise(as_stack(stack, **keywords))

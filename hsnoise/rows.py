@@ -30,8 +30,8 @@ class Nodes(eqx.Module):
     """Quadrature rules in beta = scale * sinh(u), u uniform: as fine as a row can resolve, at every gain.
 
     Rows are sorted into groups of similar gain, and each group has its own rule: `beta` and `log_weight` have shape
-    [group, node]. Where `open_below`, a group's first node also carries all that lies below it, where the curves are
-    constant (beta <= 0); elsewhere nothing does.
+    [group, node]. Where `open_below`, a group's first node also carries all that lies below it, where its curves are
+    taken as constant (they are for beta <= 0); elsewhere they have vanished there.
     """
 
     beta: jax.Array

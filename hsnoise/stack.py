@@ -156,7 +156,7 @@ class FrameStack:
         if isinstance(counts, np.memmap):
             frame = read_mapped(counts, number)
         else:
-            with _cluster_watched(frame_name(self, exposure, number)):
+            with _while_reading(frame_name(self, exposure, number)):
                 frame = np.asarray(counts[number])
         if self.is_lazy(exposure):
             check_frame(frame, self, exposure=exposure, frame_number=number)
@@ -191,7 +191,7 @@ class FrameStack:
             while combine is not None and len(tasks) > 1:
                 pairs = zip(tasks[::2], tasks[1::2], strict=False)
                 tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
-            with _cluster_watched(names[0]):
+            with _while_reading(names[0]):
                 results = dask.compute(*tasks)
             yield from results
 
@@ -346,16 +346,16 @@ def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
 
 
 @contextmanager
-def _cluster_watched(name: str) -> Iterator[None]:
+def _while_reading(name: str) -> Iterator[None]:
     """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`.
 
-    Other errors pass, those of whoever reads the chunks, say; a note says at which frame.
+    Other errors pass, those of whoever reads the chunks, say, with a note of where it was.
     """
     try:
         yield
     except Exception as error:
         if type(error).__module__.partition(".")[0] != "distributed":  # which is imported only by those who use it
-            error.add_note(f"{name}: this frame, or one of the next, could not be read")
+            error.add_note(f"while {name}, or a frame after it, was read")
             raise
         raise RuntimeError(
             f"{name}: the cluster was lost that this frame, or some after it, was read on ({type(error).__name__});"
