@@ -34,5 +34,6 @@ class RowGain(AbstractEffect):
         series = coloured_normal(
             key, (frames, rows, len(capture.channels)), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL
         )
-        beta = 1 + self.sigma[None, None] * series
-        return signal * capture.per_row(jnp.maximum(beta, 0))
+        # The clip stands between product and sum: no program may merge them, each rounds alike.
+        beta = 1 + jnp.maximum(self.sigma[None, None] * series, -1)
+        return signal * capture.per_row(beta)

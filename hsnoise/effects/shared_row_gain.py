@@ -32,4 +32,5 @@ class SharedRowGain(AbstractEffect):
         frames, rows, _ = signal.shape
         exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
         series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL)
-        return signal * jnp.maximum(1 + self.sigma * series, 0)
+        # The clip stands between product and sum, as in row_gain.
+        return signal * (1 + jnp.maximum(self.sigma * series, -1))
