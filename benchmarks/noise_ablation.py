@@ -41,7 +41,7 @@ from hsnoise.weights import load_network, save_network
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
 DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame
-BATCH, FRAMES, SIDE, CROP = 4, 8, 32, 128
+BATCH, FRAMES, CROP = 4, 8, 128
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
             [about[name]["exposure_s"] for name in frames],
             kind=["flat" if name.startswith("flat") else "dark" for name in frames],
             white_level=white,
+            cfa="mono",
             shutter="global",
         )
 
@@ -134,15 +135,15 @@ def at_exposure(params: NoiseModel, exposure_s: float) -> NoiseModel:
 
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
-    what = digest_of(noise, camera.model, [clip.frames for clip in clips])[:8]
+    what = digest_of(noise, camera.model, [clip.frames for clip in clips], options.stride, options.side)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
         return path
-    trainer = Trainer(Recipe(maps=options.maps), options.steps, camera, noise)
+    trainer = Trainer(Recipe(maps=options.maps, stride=options.stride), options.steps, camera, noise)
     state = trainer.start(seed)
     text = f"{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
-        batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, SIDE)
+        batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, options.side)
         state, value = trainer.step(state, batch, seed, step)
     save_network(path, trainer.network(state), {"camera": camera.name, "noise": name, "steps": options.steps})
     print(f"{text}: loss {float(value):.4f}", flush=True)
@@ -212,6 +213,8 @@ def main(argv: list[str] | None = None) -> None:
     add("--seeds", type=int, default=2)
     add("--steps", type=int, default=2000)
     add("--maps", type=int, default=12)
+    add("--stride", type=int, default=2, help="pixels of a block of the network: four see twice as far along a row")
+    add("--side", type=int, default=32, help="of the pieces to train on, pixels")
     add("--places", type=int, default=3, help="on the sensor, for each clip")
     add("--out", type=Path, default=Path("build/ablation"))
     options = parser.parse_args(argv)
@@ -219,13 +222,13 @@ def main(argv: list[str] | None = None) -> None:
     known, asked = sensors(folder), options.sensors.split(",")
     if not folder.is_dir() or set(asked) - set(known):
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
-    for option in ("seeds", "steps", "maps", "places"):
+    for option in ("seeds", "steps", "maps", "stride", "side", "places"):
         if getattr(options, option) < 1:
             parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")
     try:
         train, kept = held_out(read_clips(options.clips))
         kept = [clip for clip in kept if not clip.name.endswith(LONG)]
-        check_sizes([*train, *kept], FRAMES, SIDE)
+        check_sizes([*train, *kept], FRAMES, options.side)
     except (ValueError, ImportError) as error:
         parser.error(str(error))
     if len(kept) < 2:

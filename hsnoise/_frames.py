@@ -182,3 +182,17 @@ def shift_cfa(cfa: str, rows: int, columns: int) -> str:
     if cfa == "mono":
         return cfa
     return "".join(cfa[2 * ((i + rows) % 2) + (j + columns) % 2] for i in (0, 1) for j in (0, 1))
+
+
+def channel_rows(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
+    """Pixels of a channel as [colour row, pixel]: R and B every second sensor row, G all of them."""
+    if cfa == "mono":
+        return frame
+    planes = channel_planes(cfa, channel)
+    if len(planes) == 1:
+        (r, c) = planes[0]
+        return frame[r::2, c::2]
+    rows = np.empty((frame.shape[0], frame.shape[1] // 2), frame.dtype)
+    for r, c in planes:
+        rows[r::2] = frame[r::2, c::2]
+    return rows

@@ -51,13 +51,16 @@ def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scal
         raise ValueError(f"counts: expected even rows and columns for cfa {params.cfa}, got shape {counts.shape}")
     exposure_s = params.exposure_s if exposure_s is None else exposure_s
     channels = len(params.channels)
-    black = params["black_level"].value if "black_level" in params else np.zeros(channels)
-    if "black_clamp" in params:
-        black = black - np.asarray(params["black_clamp"].rate) * exposure_s
-    gain = params["gain"].value if "gain" in params else np.ones(channels)
-    dark = params["dark_current"].rate * exposure_s if "dark_current" in params else 0.0
+
+    def of(effect: str, field: str, default: float = 0.0) -> jax.Array:
+        # A fit's parameters are float64, which a session in float32 would warn of.
+        value = getattr(params[effect], field) if effect in params else jnp.full(channels, default)
+        return jnp.broadcast_to(jax.lax.convert_element_type(value, jnp.float32), (channels,))
+
+    black = of("black_level", "value") - of("black_clamp", "rate") * exposure_s
+    gain, dark = of("gain", "value", 1.0), of("dark_current", "rate") * exposure_s
     planes: list[list[jax.Array]] = [[] for _ in range(channels)]
     for (row, column), channel in np.ndenumerate(tile):
         planes[channel].append(counts[..., row::period, column::period].astype(jnp.float32))
-    electrons = [(sum(plane) / len(plane) - black[i]) / gain[i] - dark for i, plane in enumerate(planes)]
+    electrons = [(sum(plane) / len(plane) - black[i]) / gain[i] - dark[i] for i, plane in enumerate(planes)]
     return jnp.stack(electrons, -1).astype(jnp.float32)

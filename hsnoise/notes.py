@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -22,7 +23,8 @@ DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 def closing_notes(result: FitResult) -> tuple[str, ...]:
     """All sentences that belong under the table of `result`."""
     misfit = _misfit_notes(result) if result.summary.histograms else _flat_notes(result)
-    return (*parameter_notes(result), *misfit, *_order_note(result), *_warming_note(result), *_light_note(result))
+    circumstances = (note(result) for note in (_left_out_note, _order_note, _warming_note, _light_note))
+    return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
 
 
 def parameter_notes(result: FitResult) -> list[str]:
@@ -138,6 +140,21 @@ def _flat_notes(result: FitResult) -> list[str]:
         f"The variance of the flats leaves the photon transfer line by {excess.min():+.1%} to {excess.max():+.1%}"
         f" (up to {np.abs(z).max():.0f} standard errors): the response bends or darks and flats disagree, and the gain"
         " holds only on average."
+    ]
+
+
+def _left_out_note(result: FitResult) -> list[str]:
+    """What of a capture that would take too much memory is not in its histograms."""
+    summary = result.summary
+    used, given = sum(summary.n_frames), sum(summary.n_frames) + sum(summary.left_out)
+    step = min((h.row_stride for h in summary.histograms), default=1)
+    if used == given and step == 1:
+        return []
+    frames = f"{used} of {given} dark frames, spread evenly over each exposure" if used < given else "all dark frames"
+    rows = f", and on one row in {step} of them" if step > 1 else ""
+    return [
+        f"To keep within 1 GiB of memory, this fit rests on {frames}{rows}; the standard errors are those of what was"
+        " used."
     ]
 
 

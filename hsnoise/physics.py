@@ -17,7 +17,7 @@ import numpy as np
 from hsnoise import rows
 from hsnoise._numerics import bin_probability, distribution, poisson_normal_law
 from hsnoise.model import NoiseModel
-from hsnoise.statistics import FlatMoments, Summary
+from hsnoise.statistics import Summary
 
 # Added to the probability of each bin: bounds the influence of a pixel that the model excludes (a cosmic hit), and
 # the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.

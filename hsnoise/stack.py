@@ -167,22 +167,22 @@ class FrameStack:
         return (self.frame(exposure, number) for number in range(self.n_frames[exposure]))
 
     def map_frames(
-        self, exposure: int, function: Callable[[np.ndarray], Any], combine: Callable[[Any, Any], Any] | None = None
+        self, exposure: int, function: Callable[[np.ndarray], Any], combine=None, chosen: Sequence[int] | None = None
     ) -> Iterator[Any]:
-        """`function` of each frame of one exposure group, in order.
+        """`function` of each frame of one exposure group, or of those `chosen`, in order.
 
         Frames of a Dask array are read, checked and given to `function` where its scheduler runs tasks, such as the
-        workers of a cluster, and only the results come back, those of some frames as one if `combine` adds them up. A
+        workers of a cluster, and only the results come back, those of some frames as one if `combine` adds two up. A
         task whose worker is lost runs again elsewhere; RuntimeError if the whole cluster is.
         """
-        counts = self.counts[exposure]
+        counts, chosen = self.counts[exposure], range(self.n_frames[exposure]) if chosen is None else chosen
         if not is_dask(counts):
-            yield from map(function, self.frames(exposure))
+            yield from (function(self.frame(exposure, number)) for number in chosen)
             return
         import dask  # only for those who hand over a Dask array
 
-        for start in range(0, len(counts), BATCH):
-            numbers = range(start, min(start + BATCH, len(counts)))
+        for start in range(0, len(chosen), BATCH):
+            numbers = chosen[start : start + BATCH]
             names = [frame_name(self, exposure, number) for number in numbers]
             tasks = [
                 dask.delayed(_checked)(counts[number], name, self.white_level, self.row_axis, function)

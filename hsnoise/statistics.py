@@ -1,28 +1,31 @@
 """Summaries of a stack in one pass over its pixels: row histograms of darks, photon transfer of flats.
 
 Both are additive and their size does not depend on the width of the sensor. Given the row gain, the pixels of one row
-and colour are independent draws from one law, so that their histogram is sufficient (darks). Flats have a fixed
-pattern of light: their frame-to-frame differences are used (Janesick, *Photon Transfer*, 2007; EMVA 1288).
+and colour are independent draws from one law, so that their histogram is sufficient (darks; flats: see flats.py). Of a
+series whose histograms would fill more than MOST_MIB, as many frames are taken as do not.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from hsnoise._arguments import callback
 from hsnoise._counting import Bins, count_rows
-from hsnoise._frames import channel_planes
+from hsnoise._frames import channel_planes, channel_rows
 from hsnoise._types import cfa_tile, channels_of
+from hsnoise.flats import FlatMoments, flat_moments
 from hsnoise.stack import FrameStack
 
 BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
 RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
-FLICKER = 0.5  # of the mean: more is another light
+MOST_MIB = 104  # of row histograms; with the programs of a fit and what it makes of them, 1 GiB
+FEWEST_FRAMES, SMALL_SHARE = 2, 0.25
 OUTLIER_SCALE, NEAR_WIDTHS = 2.0, 6.0
 SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise
 
@@ -50,24 +53,11 @@ class RowHistograms(eqx.Module):
         return self.counts.sum(-1, dtype=np.float64)
 
 
-class FlatMoments(eqx.Module):
-    """Photon transfer of the flats: [level, channel] mean, temporal variance within rows, degrees of freedom.
-
-    `row_power` is the mean square of row means of frame differences over 2, `row_dof` its degrees of freedom.
-    """
-
-    exposure_s: np.ndarray
-    mean_dn: np.ndarray
-    variance_dn2: np.ndarray
-    dof: np.ndarray
-    row_power_dn2: np.ndarray
-    row_dof: np.ndarray
-    row_pixels: np.ndarray
-    photons_e: np.ndarray | None
-
-
 class Summary(eqx.Module):
-    """All that the likelihood and the line fit need of a capture. Made by `summarise`."""
+    """All that the likelihood and the line fit need of a capture. Made by `summarise`.
+
+    n_frames: frames of each dark exposure that are in the histograms; left_out: those that are not.
+    """
 
     exposure_s: np.ndarray
     histograms: tuple[RowHistograms, ...]
@@ -78,24 +68,11 @@ class Summary(eqx.Module):
     shutter: str = eqx.field(static=True)
     shape: tuple[int, int] = eqx.field(static=True)
     n_frames: tuple[int, ...] = eqx.field(static=True)
+    left_out: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def channels(self) -> tuple[str, ...]:
         return channels_of(self.cfa)
-
-
-def channel_rows(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
-    """Pixels of a channel as [colour row, pixel]: R and B every second sensor row, G all of them."""
-    if cfa == "mono":
-        return frame
-    planes = channel_planes(cfa, channel)
-    if len(planes) == 1:
-        (r, c) = planes[0]
-        return frame[r::2, c::2]
-    rows = np.empty((frame.shape[0], frame.shape[1] // 2), frame.dtype)
-    for r, c in planes:
-        rows[r::2] = frame[r::2, c::2]
-    return rows
 
 
 def round_up(size: int, steps: int = 2) -> int:
@@ -166,16 +143,19 @@ def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) ->
     tick = callback("progress", progress)
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
     flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
+    coding = coding_of(stack) if coding is None else coding
+    plan = _Plan.of(stack, darks, coding)
     return Summary(
         exposure_s=np.asarray([stack.exposure_s[i] for i in darks], np.float64),
-        histograms=_row_histograms(stack, darks, tick, coding or coding_of(stack)) if darks else (),
-        flats=_flat_moments(stack, flats, tick) if flats else None,
+        histograms=_row_histograms(stack, darks, tick, coding, plan) if darks else (),
+        flats=flat_moments(stack, flats, tick) if flats else None,
         black_level_dn=_black_per_channel(stack),
         white_level_dn=stack.white_level,
         cfa=stack.cfa,
         shutter=stack.shutter,
         shape=stack.shape,
-        n_frames=tuple(stack.n_frames[i] for i in darks),
+        n_frames=tuple(len(frames) for frames in plan.frames),
+        left_out=tuple(stack.n_frames[i] - len(frames) for i, frames in zip(darks, plan.frames, strict=True)),
     )
 
 
@@ -185,19 +165,50 @@ def _black_per_channel(stack: FrameStack) -> np.ndarray | None:
     return np.broadcast_to(np.asarray(stack.black_level, np.float64), (len(stack.channels),)).copy()
 
 
-def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) -> tuple[RowHistograms, ...]:
-    channels, frames = stack.channels, max(stack.n_frames[i] for i in groups)
-    # One number of bins for all channels and exposures: they share compiled programs.
-    bins = round_up(2 + max(n for of in coding for _, _, n in of.values()))
-    rows = {c: stack.shape[0] // row_stride(stack.cfa, c) for c in channels}
+class _Plan(NamedTuple):
+    """What of the darks goes into the histograms: frames of each exposure, every n-th row; and in how many bins."""
+
+    frames: list[np.ndarray]
+    row_step: int
+    bins: int
+
+    @staticmethod
+    def of(stack: FrameStack, darks: list[int], coding: Coding) -> _Plan:
+        """All, if the histograms take no more than MOST_MIB; else fewer frames, spread evenly, and in the end rows."""
+        given = [stack.n_frames[i] for i in darks]
+        rows = sum(stack.shape[0] // row_stride(stack.cfa, c) for c in stack.channels)
+        item = np.dtype(_count_type(row_pixels(stack.shape, stack.cfa))).itemsize
+        a_bin = max(len(darks), 1) * rows * item / 2**20  # MiB, of a frame of each exposure
+        # One number of bins for all channels and exposures: they share compiled programs. Small captures share more.
+        needed = 2 + max((n for of in coding for _, _, n in of.values()), default=0)
+        small = a_bin * needed * max(given, default=0) < SMALL_SHARE * MOST_MIB
+        bins = round_up(needed, steps=2 if small else 8)
+        affordable = MOST_MIB / (a_bin * bins)  # frames of each exposure
+        most = min(max(int(affordable), FEWEST_FRAMES), max(given, default=0))
+        step = 1
+        while most > step * affordable and stack.shape[0] % (4 * step) == 0:
+            step *= 2
+        frames = [np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) for n in given]
+        return _Plan(frames, step, bins)
+
+
+def _row_histograms(
+    stack: FrameStack, darks: list[int], tick, coding: Coding, plan: _Plan
+) -> tuple[RowHistograms, ...]:
+    channels, frames, bins = stack.channels, max(map(len, plan.frames)), plan.bins
+    stride = {c: row_stride(stack.cfa, c) for c in channels}
+    rows = {c: stack.shape[0] // stride[c] // plan.row_step for c in channels}
     dtype = _count_type(row_pixels(stack.shape, stack.cfa))
-    counts = {c: np.zeros((len(groups), frames, rows[c], bins), dtype) for c in channels}
-    moments = {c: np.zeros((2, len(groups), frames, rows[c])) for c in channels}
-    for e, i in enumerate(groups):
+    counts = {c: np.zeros((len(darks), frames, rows[c], bins), dtype) for c in channels}
+    moments = {c: np.zeros((2, len(darks), frames, rows[c])) for c in channels}
+    for e, (i, chosen) in enumerate(zip(darks, plan.frames, strict=True)):
         reduced = partial(_reduced, cfa=stack.cfa, coding=coding[e], bins=bins, white_level=stack.white_level)
-        for f, frame in enumerate(stack.map_frames(i, reduced)):
+        for f, frame in enumerate(stack.map_frames(i, reduced, chosen=chosen)):
             for c in channels:
-                counts[c][e, f], moments[c][:, e, f] = frame[c]
+                of_rows, sums = frame[c]
+                counts[c][e, f], moments[c][:, e, f] = of_rows[:: plan.row_step], sums[:, :: plan.row_step]
+            tick()
+        for _ in range(stack.n_frames[i] - len(chosen)):
             tick()
     edges = {c: np.stack([_edges(*of[c][:2], bins, stack.white_level) for of in coding]) for c in channels}
     return tuple(
@@ -208,7 +219,7 @@ def _row_histograms(stack: FrameStack, groups: list[int], tick, coding: Coding) 
             row_sum_of_squares=moments[c][1],
             outlier_law=_outlier_law(counts[c], edges[c]),
             channel=c,
-            row_stride=row_stride(stack.cfa, c),
+            row_stride=stride[c] * plan.row_step,
         )
         for c in channels
     )
@@ -321,65 +332,3 @@ def _edges(low: int, width: int, bins: int, white_level: float | None) -> np.nda
     edges = low - 0.5 + width * np.arange(bins - 1, dtype=np.float64)
     # Counts at the white level are clipped: they may hold everything above, so no edge lies beyond.
     return edges if white_level is None else np.minimum(edges, np.ceil(white_level) - 0.5)
-
-
-def _flat_moments(stack: FrameStack, groups: list[int], tick) -> FlatMoments:
-    columns = [_flat_level(stack, i, tick) for i in groups]
-    mean, variance, dof, row_power, row_dof, pixels = (np.stack(x) for x in zip(*columns, strict=True))
-    photons = None if stack.photons_e is None else np.asarray(stack.photons_e, np.float64)[groups]
-    exposure = np.asarray([stack.exposure_s[i] for i in groups], np.float64)
-    return FlatMoments(exposure, mean, variance, dof, row_power, row_dof, pixels, photons)
-
-
-def _check_same_light(levels: list[float], stack: FrameStack, group: int) -> None:
-    """Frames of a flat group must be of one light: a lamp may flicker, not change."""
-    if max(levels) - min(levels) > FLICKER * np.mean(levels):
-        raise ValueError(
-            f"flats: frames of exposure group {group} ({stack.exposure_s[group]:g} s) differ in mean, from"
-            f" {min(levels):.4g} to {max(levels):.4g} DN; a group holds frames of the same light, so give each"
-            " brightness its own group (its own array, or its own exposure_s)"
-        )
-
-
-Moments = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
-
-
-def _within_rows(frame: np.ndarray, cfa: str, channels: tuple[str, ...]) -> Moments:
-    """Of each channel: counts less their row's mean, float32, their squares, the means of the rows [1, row]."""
-    out = {}
-    for c in channels:
-        y = channel_rows(frame, cfa, c).astype(np.float32)
-        row_mean = y.mean(1, dtype=np.float64)
-        y -= row_mean[:, None].astype(np.float32)
-        out[c] = y, y * y, row_mean[None]
-    return out
-
-
-def _added(a: Moments, b: Moments) -> Moments:
-    """Of all frames of both: sums of counts and squares, and the means of the rows [frame, row]."""
-    return {c: (a[c][0] + b[c][0], a[c][1] + b[c][1], np.concatenate([a[c][2], b[c][2]])) for c in a}
-
-
-def _flat_level(stack: FrameStack, group: int, tick):
-    """Mean, temporal variance and row power of one flat level, each [channel]."""
-    if stack.n_frames[group] < 2:
-        raise ValueError(
-            f"flats: exposure group {group} ({stack.exposure_s[group]:g} s) has one frame; photon transfer needs at"
-            " least two frames of the same light, because only differences are free of the fixed pattern"
-        )
-    channels, n = stack.channels, stack.n_frames[group]
-    totals = reduce(_added, stack.map_frames(group, partial(_within_rows, cfa=stack.cfa, channels=channels), _added))
-    for _ in range(n):
-        tick()
-    out = []
-    for c in channels:
-        first, second, series = totals[c]
-        _check_same_light(list(series.mean(1)), stack, group)
-        rows, pixels = first.shape
-        dof = rows * (pixels - 1) * (n - 1)
-        variance = float((second.astype(np.float64) - first.astype(np.float64) ** 2 / n).sum() / dof)
-        moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
-        moving -= moving.mean(0, keepdims=True)
-        row_dof = (rows - 1) * (n - 1)
-        out.append((series.mean(), variance, dof, float((moving**2).sum() / row_dof), row_dof, pixels))
-    return tuple(np.asarray(x, np.float64) for x in zip(*out, strict=True))

@@ -12,6 +12,7 @@ import pytest
 import hsnoise
 from benchmarks import simulator
 from hsnoise import maximise as maximise_module
+from hsnoise import statistics
 from hsnoise.model import sample_dark
 from hsnoise.moments import _of_one_rate
 
@@ -268,6 +269,17 @@ def assert_pilot_ends_where(whole, monkeypatch):
         value, error, _ = whole.table[name]
         assert abs(piloted.table[name][0] - value) < 0.1 * error
         assert 0.7 < piloted.table[name][1] / error < 1.4
+
+
+def test_a_capture_larger_than_memory_is_fitted_on_a_part_of_it_and_told(monkeypatch, canon_fit):
+    model, whole = canon_fit
+    monkeypatch.setattr(statistics, "MOST_MIB", sum(h.counts.nbytes for h in whole.summary.histograms) / 2**20 / 2)
+    part = hsnoise.fit(capture(model))
+    assert_recovered(part, model)
+    assert "rests on" in part.notes[0]
+    # Of half the frames, or somewhat more where their histograms have fewer bins.
+    for name in ("read_noise.sigma", "dark_current.rate"):
+        assert 1.05 < part.table[name][1] / whole.table[name][1] < 1.5
 
 
 @pytest.mark.slow

@@ -43,6 +43,14 @@ def test_noisy_frames_have_the_light_as_their_mean():
     np.testing.assert_allclose(found.mean((0, 1, 2)), [3, 8, 5], atol=0.15)
 
 
+def test_a_fitted_camera_is_taken_without_a_warning(recwarn):
+    with jax.enable_x64(True):  # as a fit makes it
+        camera = hsnoise.cameras.canon_5d3(black_level_dn=200.0)
+    assert camera["gain"].value.dtype == np.float64
+    assert electrons_of(np.full((2, 4, 6), 300, np.uint16), camera).dtype == np.float32
+    assert not recwarn.list
+
+
 def test_bad_input_is_named():
     with pytest.raises(ValueError, match="light: expected"):
         mosaic(LIGHT[..., :2], "RGGB")

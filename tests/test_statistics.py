@@ -11,12 +11,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis.extra.numpy import arrays
 
-from hsnoise._frames import LazyFrames
+from hsnoise import statistics
+from hsnoise._frames import LazyFrames, channel_rows
 from hsnoise._types import BAYER_CFAS
 from hsnoise.stack import FrameStack
 from hsnoise.statistics import (
     MOST_BINS,
-    channel_rows,
     every_nth_row,
     round_up,
     row_stride,
@@ -230,6 +230,27 @@ def test_every_nth_row_thins_the_rows_of_each_colour(rng):
     for cut, h in zip(thin.histograms, summary.histograms, strict=True):
         np.testing.assert_array_equal(cut.counts, h.counts[:, :, ::4])
         assert cut.row_stride == 4 * h.row_stride
+
+
+@pytest.mark.parametrize(
+    ("cfa", "frames", "kept", "step"),
+    [("mono", (9, 3), ([0, 3, 5, 8], [0, 1, 2]), 1), ("RGGB", (4, 2), ([0, 3], [0, 1]), 4)],
+)
+def test_what_would_fill_memory_is_thinned_evenly(rng, monkeypatch, cfa, frames, kept, step):
+    counts = [dark_counts(rng, n, (32, 12), mean=mean) for n, mean in zip(frames, (40, 60), strict=True)]
+    stack = FrameStack(counts, [0.1, 0.2], cfa=cfa)
+    whole = summarise(stack)
+    mib = sum(h.counts.nbytes for h in whole.histograms) / 2**20
+    monkeypatch.setattr(statistics, "MOST_MIB", mib * len(kept[0]) / frames[0] / step)
+    summary = summarise(stack)
+    assert summary.n_frames == tuple(map(len, kept))
+    assert np.array_equal(np.add(summary.n_frames, summary.left_out), frames)
+    for h, of in zip(summary.histograms, whole.histograms, strict=True):
+        assert h.row_stride == step * of.row_stride
+        for e, chosen in enumerate(kept):
+            np.testing.assert_array_equal(h.row_sum[e, : len(chosen)], of.row_sum[e, chosen, ::step])
+            np.testing.assert_array_equal(h.row_pixels[e, : len(chosen)], of.row_pixels[e, chosen, ::step])
+    assert sum(h.counts.nbytes for h in summary.histograms) <= statistics.MOST_MIB * 2**20
 
 
 def test_without_counts_all_else_remains(rng):
