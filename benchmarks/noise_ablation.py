@@ -37,11 +37,13 @@ from hsnoise._output import write_atomically
 from hsnoise._progress import busy
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import GREY, display_from_linear, light_of_frames
+from hsnoise.physics import ROUNDING_VARIANCE
 from hsnoise.weights import load_network, save_network
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
 DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame
 BATCH, FRAMES, CROP = 4, 8, 128
+OUTSIDE = 6.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -55,14 +57,19 @@ class Sensor:
 
     @cached_property
     def dark_sigma_dn(self) -> float:
-        """Temporal standard deviation of the fitted darks nearest in exposure, DN: from differences of frames."""
+        """Temporal standard deviation of the fitted darks nearest in exposure, DN, before they were rounded to counts.
+
+        From differences of frames.
+        """
         stack = self.fitted
         darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
         chosen = min(darks, key=lambda i: abs(stack.exposure_s[i] - self.exposure_s))
         frames = np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
-        # Cosmic rays are rare and huge: the middle of the differences tells of the rest.
-        low, high = np.quantile(np.diff(frames, axis=0), [0.1587, 0.8413])
-        return float((high - low) / 2 / np.sqrt(2))
+        apart = np.diff(frames, axis=0)
+        # Cosmic rays are rare and huge: differences that are far outside the others count as just outside.
+        low, high = np.quantile(apart, [0.1587, 0.8413])
+        far = OUTSIDE * (high - low) / 2
+        return float(np.sqrt(np.mean(np.clip(apart, -far, far) ** 2) / 2 - ROUNDING_VARIANCE))
 
     def dark_sigma_e(self, params: NoiseModel) -> float:
         return self.dark_sigma_dn / float(np.mean(np.asarray(params["gain"].value)))

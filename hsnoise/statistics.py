@@ -24,7 +24,7 @@ from hsnoise.stack import FrameStack
 BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
 RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
-MOST_MIB = 104  # of row histograms; with the programs of a fit and what it makes of them, 1 GiB
+MOST_MIB = 112  # of row histograms; with the programs of a fit and what it makes of them, 1 GiB
 FEWEST_FRAMES, SMALL_SHARE = 2, 0.25
 OUTLIER_SCALE, NEAR_WIDTHS = 2.0, 6.0
 SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise

@@ -351,6 +351,14 @@ def test_light_is_added_to_real_dark_frames():
     assert noisy.std() * 20 == pytest.approx(np.sqrt(electrons + 4 + (1 / 12 / 0.25) * 2), rel=0.05)
 
 
+@pytest.mark.parametrize("sigma_dn", [0.7, 1.5, 20.0])
+def test_noise_of_darks_is_told_before_rounding_and_without_cosmic_hits(rng, sigma_dn):
+    darks = np.rint(100 + sigma_dn * rng.standard_normal((6, 200, 200)))
+    darks[rng.random(darks.shape) < 2e-5] = 50_000
+    sensor = noise_ablation.Sensor("sensor", hsnoise.FrameStack(darks.astype(np.uint16), 0.1), darks, 0.1)
+    assert sensor.dark_sigma_dn == pytest.approx(sigma_dn, rel=0.01)
+
+
 def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
     base = np.array([[20.0, 22.0, 24.0, 26.0]] * 2)
     apart = np.array([[0.9, 1.1, 0.9, 1.1], [1.1, 1.3, 1.1, 1.3]])
