@@ -58,8 +58,8 @@ def _first_frames(path: Path) -> np.ndarray:
     return np.stack(frames)
 
 
-def held_out(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
-    """(to train on, held out): every fourth video in the order of names, with all cuts of it.
+def held_out(clips: Sequence[Clip], fold: int = 0) -> tuple[list[Clip], list[Clip]]:
+    """(to train on, held out): every fourth video in the order of names, with all cuts of it; other ones in each fold.
 
     Raises:
         ValueError: fewer than two videos.
@@ -67,7 +67,8 @@ def held_out(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
     sources = sorted({clip.source for clip in clips})
     if len(sources) < 2:
         raise ValueError(f"clips: expected at least two videos, one of them is held out; got {len(sources)}")
-    kept = set(sources[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or sources[-1:])
+    every = min(HELD_OUT_EVERY, len(sources))
+    kept = set(sources[(every - 1 - fold) % every :: every])
     # A longer cut of a video shows nothing new to train on.
     names = {clip.name for clip in clips}
     train = [c for c in clips if c.source not in kept and (c.name == c.source or c.source not in names)]

@@ -1,6 +1,6 @@
 """Does the better noise model give the better enhancer? On real dark frames, which nobody simulated.
 
-    python -m benchmarks.noise_ablation --clips FOLDER --seeds 2
+    python -m benchmarks.noise_ablation --clips FOLDER
 
 The same network and steps are trained with (a) independent Gaussian noise of the sensor's variance, (b) shot and read
 noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that after
@@ -181,7 +181,7 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
     return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
 
 
-def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> list[float]:
+def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> dict[str, float]:
     """PSNR of each clip, dB, mean over several places of the sensor: places share what is hard about a clip."""
     net, _ = load_network(path)
     video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
@@ -190,26 +190,38 @@ def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], 
         clean, noisy = real_scene(sensor, clip, camera, seed)
         return psnr_db(np.asarray(video(jnp.asarray(noisy))), clean)
 
-    return [float(np.mean([psnr(clip, 1000 * i + place) for place in range(places)])) for i, clip in enumerate(clips)]
+    seeds = {clip.name: [1000 * i + place for place in range(places)] for i, clip in enumerate(clips)}
+    return {clip.name: float(np.mean([psnr(clip, seed) for seed in seeds[clip.name]])) for clip in clips}
 
 
-def table_of(results: dict[str, dict[str, list[list[float]]]]) -> Sheet:
-    """Mean PSNR of each sensor and noise, and its gain over (b) with a standard error over clips and seeds."""
+def table_of(results: dict[str, dict[str, list[dict[str, float]]]]) -> Sheet:
+    """Mean PSNR of each sensor and noise over seeds and their clips, and its gain over (b) with a standard error."""
     head = ("sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian")
     rows = []
     for sensor, of in results.items():
-        row = [sensor, *(f"{np.mean(of[name]):.2f}" for name in NOISES)]
+        row = [sensor, *(f"{np.mean([v for clips in of[name] for v in clips.values()]):.2f}" for name in NOISES)]
         for name in ("paper", "improved"):
-            apart = np.asarray(of[name]) - np.asarray(of["poisson-gaussian"])  # [seed, clip]
-            error = np.hypot(apart.mean(0).std(ddof=1) / np.sqrt(apart.shape[1]), between(apart.mean(1)))
-            row.append(f"{apart.mean():+.2f} +- {error:.2f} dB")
+            pairs = zip(of[name], of["poisson-gaussian"], strict=True)
+            mean, error = gain_of([{clip: one[clip] - other[clip] for clip in one} for one, other in pairs])
+            row.append(f"{mean:+.2f} +- {error:.2f} dB")
         rows.append(tuple(row))
     return Sheet("PSNR on real dark frames, dB", head, rows)
 
 
-def between(means: np.ndarray) -> float:
-    """Standard error of the mean over seeds; 0 of one seed, which says nothing of it."""
-    return float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
+def gain_of(apart: list[dict[str, float]]) -> tuple[float, float]:
+    """Mean of differences {clip: dB} of several seeds, and its standard error: over clips, or seeds if that is more.
+
+    Seeds hold out other clips, so that the scatter between clips is in both; that between trainings is in the second.
+    """
+    of_clips = [[of[clip] for of in apart if clip in of] for clip in sorted({clip for of in apart for clip in of})]
+    of_seeds = [list(of.values()) for of in apart]
+    errors = [standard_error([float(np.mean(values)) for values in groups]) for groups in (of_clips, of_seeds)]
+    return float(np.mean([value for of in of_seeds for value in of])), max(errors)
+
+
+def standard_error(means: Sequence[float]) -> float:
+    """Of the mean of these means; 0 of one, which says nothing of it."""
+    return float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -217,7 +229,7 @@ def main(argv: list[str] | None = None) -> None:
     add = parser.add_argument
     add("--clips", type=Path)
     add("--sensors", default="imx541,stl1001,tc237")
-    add("--seeds", type=int, default=2)
+    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out other clips")
     add("--steps", type=int, default=2000)
     add("--maps", type=int, default=12)
     add("--stride", type=int, default=2, help="pixels of a block of the network: four see twice as far along a row")
@@ -233,24 +245,25 @@ def main(argv: list[str] | None = None) -> None:
         if getattr(options, option) < 1:
             parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")
     try:
-        train, kept = held_out(read_clips(options.clips))
-        kept = [clip for clip in kept if not clip.name.endswith(LONG)]
-        check_sizes([*train, *kept], FRAMES, options.side)
+        clips = read_clips(options.clips)
+        folds = [held_out(clips, seed) for seed in range(options.seeds)]
+        check_sizes(clips, FRAMES, options.side)
     except (ValueError, ImportError) as error:
         parser.error(str(error))
-    if len(kept) < 2:
-        parser.error("--clips: expected at least two held-out videos (eight in all), for an error over clips")
+    if len({clip.source for _, kept in folds for clip in kept}) < 2:
+        parser.error("--clips, --seeds: expected at least two held-out videos, for an error over clips")
     options.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, dict[str, list[list[float]]]] = {}
+    results: dict[str, dict[str, list[dict[str, float]]]] = {}
     for name in asked:
         sensor = known[name]()
         models = models_of(sensor, options.out)
         camera = camera_of(sensor, models["paper"])
-        of: dict[str, list[list[float]]] = {noise: [] for noise in NOISES}
-        for seed in range(options.seeds):
+        of: dict[str, list[dict[str, float]]] = {noise: [] for noise in NOISES}
+        for seed, (train, kept) in enumerate(folds):
+            shown = [clip for clip in kept if not clip.name.endswith(LONG)]
             for noise in NOISES:
                 path = trained(camera, noise, models[noise], train, seed, options)
-                of[noise].append(measured(sensor, path, camera, kept, options.places))
+                of[noise].append(measured(sensor, path, camera, shown, options.places))
         results[name] = of
         sheet = table_of(results)
         Console(width=130).print(sheet.rich())

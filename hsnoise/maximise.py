@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._compiling import jit_lean
+from hsnoise._memory import give_back_free_memory
 from hsnoise.coordinates import Coordinates
 from hsnoise.physics import Physics, Rules, evaluate
 from hsnoise.plan import CLOSE_MARGIN, plan_rules, replan
@@ -56,12 +57,14 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     """
     if _n_rows(summary) < 2 * MANY_ROWS:
         return _by_rounds(coordinates, summary)
+    give_back_free_memory()  # here and where compiling is done: the fit stays within 1 GiB by it
     frames = max(1, int(max(summary.n_frames) * MANY_ROWS / _n_rows(summary)))
     few, thinning = some_frames(summary, 0, frames), 1
     coarsest = max(h.row_stride for h in summary.histograms)
     while _n_rows(few) > 2 * thinning * PILOT_ROWS and summary.shape[0] % (2 * thinning * coarsest) == 0:
         thinning *= 2
     pilot = _by_rounds(coordinates, every_nth_row(few, thinning))
+    give_back_free_memory()
     scale = sum(summary.n_frames) / sum(few.n_frames)
     darks, flats = _pieces(pilot.physics, summary, frames)
     # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.

@@ -94,8 +94,9 @@ def binned_moments(histograms: RowHistograms):
     inside[:, -1] = 0.0
     inside[edges[:, 0] > 0.5, 0] = 0.0  # an open bin, unless it holds the code 0 alone
     powers = np.stack([inside, inside * centres, inside * centres**2], axis=-1)
-    sums = [n.astype(np.float32) @ p for n, p in zip(histograms.counts, powers.astype(np.float64), strict=True)]
-    pixels, first, second = np.moveaxis(np.stack(sums), -1, 0)
+    # Frame by frame: as floats the histograms take four times the memory.
+    sums = [[frame.astype(np.float64) @ p for frame in of] for of, p in zip(histograms.counts, powers, strict=True)]
+    pixels, first, second = np.moveaxis(np.array(sums), -1, 0)
     n = np.maximum(pixels, 2)
     mean = first / n
     return pixels, mean, (second - n * mean**2) / (n - 1)

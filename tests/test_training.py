@@ -182,6 +182,8 @@ def test_held_out_videos_are_held_out_with_their_long_cuts():
     trained, kept = held_out(clips)
     assert [clip.name for clip in trained] == ["a", "b", "c", "e"]
     assert [clip.name for clip in kept] == ["d", "d_long"]
+    folds = [{clip.source for clip in held_out(clips, fold)[1]} for fold in range(5)]
+    assert folds == [{"d"}, {"c"}, {"b"}, {"a", "e"}, {"d"}]
     with pytest.raises(ValueError, match="at least two"):
         held_out(clips[:1])
 
@@ -360,9 +362,17 @@ def test_noise_of_darks_is_told_before_rounding_and_without_cosmic_hits(rng, sig
 
 
 def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
-    base = np.array([[20.0, 22.0, 24.0, 26.0]] * 2)
-    apart = np.array([[0.9, 1.1, 0.9, 1.1], [1.1, 1.3, 1.1, 1.3]])
-    of = {"gaussian": base - 1, "poisson-gaussian": base, "paper": base + apart, "improved": base + 2 * apart}
-    text = noise_ablation.table_of({"imx541": {name: values.tolist() for name, values in of.items()}}).markdown()
-    over_clips = apart.mean(0).std(ddof=1) / 2
-    assert f"| +1.10 +- {np.hypot(over_clips, 0.1):.2f} dB |" in text and "| 23.00 | 24.10 |" in text
+    base = [{"a": 20.0, "b": 22.0}, {"c": 24.0, "d": 26.0}]
+    apart = [{"a": 0.9, "b": 1.3}, {"c": 1.1, "d": 1.5}]
+
+    def moved(by):
+        return [{clip: value + by * apart[i][clip] for clip, value in of.items()} for i, of in enumerate(base)]
+
+    of = {"gaussian": moved(-1), "poisson-gaussian": base, "paper": moved(1), "improved": moved(2)}
+    text = noise_ablation.table_of({"imx541": of}).markdown()
+    over_clips = np.std([0.9, 1.3, 1.1, 1.5], ddof=1) / 2
+    assert f"| +1.20 +- {over_clips:.2f} dB |" in text and "| 23.00 | 24.20 |" in text
+    # Trainings that differ by more than clips do count; a clip that two of them saw counts once.
+    mean, error = noise_ablation.gain_of([{"a": 1.0, "b": 1.2}, {"a": 2.0, "b": 2.2}])
+    assert (mean, error) == pytest.approx((1.6, 0.5))
+    assert noise_ablation.gain_of([{"a": 1.0, "b": 1.4}])[1] == pytest.approx(0.2)
