@@ -16,6 +16,7 @@ import numpy as np
 
 from hsnoise import rows
 from hsnoise._numerics import bin_probability, distribution, poisson_normal_law
+from hsnoise.flats import FlatMoments
 from hsnoise.model import NoiseModel
 from hsnoise.statistics import Summary
 
