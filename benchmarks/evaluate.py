@@ -2,7 +2,7 @@
 
     python -m benchmarks.evaluate build/train/weights.eqx --clips FOLDER
 
-Writes a table and figures to `--out`: PSNR against illuminance and against frame number, and frames side by side. BM3D
+Writes a table and figures to `--out`: PSNR against illuminance and number of frames seen, frames side by side. BM3D
 and BM4D take part if the extra `peers` is installed; BM4D over the frame axis stands for VBM4D, which has no package.
 """
 
@@ -33,7 +33,7 @@ from hsnoise.weights import load_network
 
 LEVELS = 3
 LEAST_CROP, LEAST_FRAMES = 8, 3
-REFER, OURS, ALONE = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, memory emptied before each frame"
+REFER, OURS = "scaled input", "hsnoise ST-LSTM"
 SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
 
 
@@ -78,7 +78,7 @@ def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
 
 
 def network_of(path: Path, camera: Camera, scored: Sequence[Clip]):
-    """The enhancer as two functions of a scene: of the whole video, and of each frame as if it were the first.
+    """The enhancer as a function of noisy linear light [frame, example, row, column, channel].
 
     Raises:
         ValueError: weights of another number of channels, or trained on clips that are to be scored.
@@ -91,14 +91,30 @@ def network_of(path: Path, camera: Camera, scored: Sequence[Clip]):
         raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
     if about.get("camera") != camera.name:
         print(f"Note: {path} was trained for camera {about.get('camera')}, not {camera.name}")
-    video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
-    alone = eqx.filter_jit(lambda noisy: net.video(noisy[None])[0])
-    return lambda scene: np.asarray(video(scene.noisy)), lambda scene: np.asarray(alone(scene.noisy))
+    video = eqx.filter_jit(net.video)
+    return lambda noisy: np.asarray(video(noisy))
+
+
+def while_memory_fills(net, scene: Scene) -> list[float]:
+    """PSNR of the nth frame that the network sees, dB, n from 1: of the same frames for each n, whatever they show.
+
+    The video is begun anew at each frame; scored are the frames of its second half, or those from the last of
+    SHOWN_FRAMES on.
+    """
+    n = len(scene.noisy)
+    most = min((n + 1) // 2, SHOWN_FRAMES[-1])
+    places = np.minimum(np.arange(most)[:, None] + np.arange(n), n - 1)  # [seen, begun at]
+    found = np.clip(net(scene.noisy[places]), 0, 1)
+    scored = range(most - 1, n)
+    return [float(np.mean([psnr_db(found[seen, f - seen], scene.clean[f]) for f in scored])) for seen in range(most)]
 
 
 def methods_of(net, tuning: Scene, untrained: bool) -> dict:
     """Name to function from a scene to display values."""
-    found = {REFER: lambda scene: np.asarray(display_from_linear(scene.noisy)), OURS: net}
+    found = {
+        REFER: lambda scene: np.asarray(display_from_linear(scene.noisy)),
+        OURS: lambda scene: net(scene.noisy[:, None])[:, 0],
+    }
     for name, denoise in rivals().items() if untrained else ():
         strength, linear = tuned(denoise, tuning.noisy, tuning.clean, tuning.sigma)
         found[name] = lambda scene, f=denoise, s=strength, linear=linear: denoised(
@@ -131,18 +147,16 @@ def tables(records: list[dict], unit_of_light) -> tuple[Sheet, Sheet]:
     return Sheet("Held-out clips", head, rows), Sheet("PSNR of each clip, dB", ("clip", *methods), by_clip)
 
 
-def memory_sheet(long: list[dict]) -> Sheet:
-    """What the frames before are worth: PSNR of frame n with and without them, mean over the long clips."""
-    shown = [f for f in SHOWN_FRAMES if any(r["frame"] == f - 1 for r in long)]
-    rows = [
-        (method, *(f"{mean_of(long, 'psnr_db', method=method, frame=f - 1):.2f}" for f in shown))
-        for method in (OURS, ALONE)
-    ]
-    return Sheet("PSNR against frame number, long clips, dB", ("", *(f"frame {f}" for f in shown)), rows)
+def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
+    """What the frames before are worth, for each clip."""
+    shown = [n for n in SHOWN_FRAMES if n <= max(map(len, filling.values()))]
+    rows = [(clip, *(f"{of[n - 1]:.2f}" if n <= len(of) else "" for n in shown)) for clip, of in filling.items()]
+    title = "PSNR of the nth frame that the network sees, the same frames for each n, dB"
+    return Sheet(title, ("clip", *(f"n = {n}" for n in shown)), rows)
 
 
-def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
-    """PSNR against illuminance (all methods) and against frame number (long clips), with and without memory."""
+def draw_curves(records: list[dict], filling: dict[str, list[float]], unit_of_light) -> Figure:
+    """PSNR against illuminance (all methods) and against the number of frames that the network has seen."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     levels = sorted({r["white_e"] for r in records})
@@ -156,16 +170,12 @@ def draw_curves(records: list[dict], long: list[dict], unit_of_light) -> Figure:
     left.set_ylabel("PSNR (dB)")
     left.legend(fontsize=8)
     left.set_title("Against light", loc="left")
-    for i, clip in enumerate(dict.fromkeys(r["clip"] for r in long)):
-        for method, style, about in ((OURS, "o-", ""), (ALONE, ":", ", memory emptied")):
-            own = [r for r in long if r["clip"] == clip and r["method"] == method]
-            frames = sorted({r["frame"] for r in own})
-            values = [mean_of(own, "psnr_db", frame=f) for f in frames]
-            right.plot([f + 1 for f in frames], values, style, ms=3, color=f"C{i}", label=f"{clip}{about}")
-    right.set_xlabel("frame")
-    right.set_ylabel("PSNR (dB)")
+    for clip, values in filling.items():
+        right.plot(range(1, len(values) + 1), values, "o-", ms=3, label=clip)
+    right.set_xlabel("frames seen, the scored one included")
+    right.set_ylabel("PSNR of the same frames (dB)")
     right.legend(fontsize=8)
-    right.set_title("Against frame number", loc="left")
+    right.set_title("While the memory fills", loc="left")
     return figure
 
 
@@ -212,7 +222,7 @@ def evaluate(options: argparse.Namespace) -> None:
     train, kept = held_out(read_clips(options.clips))
     check_sizes([*train, *kept], LEAST_FRAMES, LEAST_CROP)
     levels = np.geomspace(*camera.white_e, LEVELS)
-    net, alone = network_of(options.weights, camera, kept)
+    net = network_of(options.weights, camera, kept)
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
     lux = OPTICS.get(camera.name)
@@ -230,15 +240,14 @@ def evaluate(options: argparse.Namespace) -> None:
         if level == middle:
             write_figure(options.out / f"frames-{clip.name}.png", draw_frames(scene, found), dpi=110)
     # Without longer cuts, the clips themselves show how the memory fills.
-    long = []
+    filling = {}
     for number, clip in enumerate([c for c in kept if c.name.endswith(LONG)] or short):
-        scene = scene_of(clip, camera, middle, options.crop, 1000 + number)
-        long += scores(OURS, scene, net(scene)) + scores(ALONE, scene, alone(scene))
-    sheets = (*tables(records, unit_of_light), memory_sheet(long))
+        filling[clip.name] = while_memory_fills(net, scene_of(clip, camera, middle, options.crop, 1000 + number))
+    sheets = (*tables(records, unit_of_light), memory_sheet(filling))
     for sheet in (sheets[0], sheets[-1]):
         Console(width=130).print(sheet.rich())
     write_atomically(options.out / "evaluation.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
-    curves = draw_curves(records, long, unit_of_light)
+    curves = draw_curves(records, filling, unit_of_light)
     write_figure(options.out / "curves.png", curves, dpi=110)
     print(f"Written to {options.out}: evaluation.md, curves.png, frames-*.png")
 

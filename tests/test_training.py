@@ -188,6 +188,20 @@ def test_held_out_videos_are_held_out_with_their_long_cuts():
         held_out(clips[:1])
 
 
+def test_frames_seen_count_whatever_the_frames_show(rng):
+    """A network that takes the mean of the frames so far: white noise of 0.1 falls with their root."""
+    clean = np.broadcast_to(np.linspace(0.3, 0.7, 7)[:, None, None, None], (7, 40, 40, 1))
+    scene = evaluate.Scene("ramp", 10.0, clean, clean + 0.1 * rng.standard_normal(clean.shape))
+
+    def net(noisy):  # less what it knows of the ramp, so that only its noise is left
+        seen = np.arange(1, len(noisy) + 1).reshape(-1, 1, 1, 1, 1)
+        ramp = (clean[1] - clean[0]).max() * (seen - 1) / 2
+        return np.cumsum(noisy, 0) / seen + ramp
+
+    found = evaluate.while_memory_fills(net, scene)
+    np.testing.assert_allclose(found, 20 + 10 * np.log10(np.arange(1, 5)), atol=0.3)
+
+
 def test_stills_move_smoothly():
     clips = moving_stills()
     assert len(clips) >= 6
