@@ -152,10 +152,7 @@ def _left_out_note(result: FitResult) -> list[str]:
         return []
     frames = f"{used} of {given} dark frames, spread evenly over each exposure" if used < given else "all dark frames"
     rows = f", and on one row in {step} of them" if step > 1 else ""
-    return [
-        f"To keep within 1 GiB of memory, this fit rests on {frames}{rows}; the standard errors are those of what was"
-        " used."
-    ]
+    return [f"To save memory, this fit rests on {frames}{rows}; the standard errors are those of what was used."]
 
 
 def _order_note(result: FitResult) -> list[str]:

@@ -2,7 +2,8 @@
 
 Both are additive and their size does not depend on the width of the sensor. Given the row gain, the pixels of one row
 and colour are independent draws from one law, so that their histogram is sufficient (darks; flats: see flats.py). Of a
-series whose histograms would fill more than MOST_MIB, as many frames are taken as do not.
+series whose histograms would fill more than MOST_MIB, as many frames are taken as do not; of few tall frames with wide
+ranges of counts, rows are left out where their number has a divisor.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
 RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
 MOST_MIB = 112  # of row histograms; with the programs of a fit and what it makes of them, 1 GiB
-FEWEST_FRAMES, SMALL_SHARE = 2, 0.25
+FEWEST_FRAMES, FEWEST_ROWS, SMALL_SHARE = 2, 16, 0.25
 OUTLIER_SCALE, NEAR_WIDTHS = 2.0, 6.0
 SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise
 
@@ -185,9 +186,10 @@ class _Plan(NamedTuple):
         bins = round_up(needed, steps=2 if small else 8)
         affordable = MOST_MIB / (a_bin * bins)  # frames of each exposure
         most = min(max(int(affordable), FEWEST_FRAMES), max(given, default=0))
-        step = 1
-        while most > step * affordable and stack.shape[0] % (4 * step) == 0:
-            step *= 2
+        # Rows that are left must be evenly spaced around the frame, for the spectrum of their gains.
+        of_colour = stack.shape[0] // max(row_stride(stack.cfa, c) for c in stack.channels)
+        steps = [n for n in range(1, max(of_colour // FEWEST_ROWS, 1) + 1) if of_colour % n == 0]
+        step = next((n for n in steps if most <= n * affordable), steps[-1])
         frames = [np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) for n in given]
         return _Plan(frames, step, bins)
 

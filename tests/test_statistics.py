@@ -233,11 +233,15 @@ def test_every_nth_row_thins_the_rows_of_each_colour(rng):
 
 
 @pytest.mark.parametrize(
-    ("cfa", "frames", "kept", "step"),
-    [("mono", (9, 3), ([0, 3, 5, 8], [0, 1, 2]), 1), ("RGGB", (4, 2), ([0, 3], [0, 1]), 4)],
+    ("cfa", "rows", "frames", "kept", "step"),
+    [
+        ("mono", 32, (9, 3), ([0, 3, 5, 8], [0, 1, 2]), 1),
+        ("RGGB", 128, (4, 2), ([0, 3], [0, 1]), 4),
+        ("RGGB", 126, (4, 2), ([0, 3], [0, 1]), 3),
+    ],
 )
-def test_what_would_fill_memory_is_thinned_evenly(rng, monkeypatch, cfa, frames, kept, step):
-    counts = [dark_counts(rng, n, (32, 12), mean=mean) for n, mean in zip(frames, (40, 60), strict=True)]
+def test_what_would_fill_memory_is_thinned_evenly(rng, monkeypatch, cfa, rows, frames, kept, step):
+    counts = [dark_counts(rng, n, (rows, 12), mean=mean) for n, mean in zip(frames, (40, 60), strict=True)]
     stack = FrameStack(counts, [0.1, 0.2], cfa=cfa)
     whole = summarise(stack)
     mib = sum(h.counts.nbytes for h in whole.histograms) / 2**20
