@@ -98,11 +98,11 @@ def network_of(path: Path, camera: Camera, scored: Sequence[Clip]):
 def while_memory_fills(net, scene: Scene) -> list[float]:
     """PSNR of the nth frame that the network sees, dB, n from 1: of the same frames for each n, whatever they show.
 
-    The video is begun anew at each frame; scored are the frames of its second half, or those from the last of
-    SHOWN_FRAMES on.
+    The video, or what memory holds of a long one many times over, is begun anew at each frame; scored is its second
+    half.
     """
-    n = len(scene.noisy)
-    most = min((n + 1) // 2, SHOWN_FRAMES[-1])
+    n = min(len(scene.noisy), 2 * SHOWN_FRAMES[-1])
+    most = (n + 1) // 2
     places = np.minimum(np.arange(most)[:, None] + np.arange(n), n - 1)  # [seen, begun at]
     found = np.clip(net(scene.noisy[places]), 0, 1)
     scored = range(most - 1, n)

@@ -167,13 +167,16 @@ class FrameStack:
         return (self.frame(exposure, number) for number in range(self.n_frames[exposure]))
 
     def map_frames(
-        self, exposure: int, function: Callable[[np.ndarray], Any], combine=None, chosen: Sequence[int] | None = None
+        self,
+        exposure: int,
+        function: Callable[[np.ndarray], Any],
+        combine: Callable[[Any, Any], Any] | None = None,
+        chosen: Sequence[int] | None = None,
     ) -> Iterator[Any]:
         """`function` of each frame of one exposure group, or of those `chosen`, in order.
 
-        Frames of a Dask array are read, checked and given to `function` where its scheduler runs tasks, such as the
-        workers of a cluster, and only the results come back, those of some frames as one if `combine` adds two up. A
-        task whose worker is lost runs again elsewhere; RuntimeError if the whole cluster is.
+        Frames of a Dask array are read, checked and reduced where its scheduler runs, such as on a cluster's workers;
+        results come back, some as one if `combine` adds two up. Lost tasks run again; RuntimeError if all workers are.
         """
         counts, chosen = self.counts[exposure], range(self.n_frames[exposure]) if chosen is None else chosen
         if not is_dask(counts):

@@ -26,7 +26,8 @@ BINS_PER_SIGMA = 6  # coarser codes lose less than 0.3 % of the information
 RANGE_SIGMAS = 10.0
 MOST_BINS = 4096  # rows may differ by far more than the pixels within one do (glow, strong row gains)
 MOST_MIB = 112  # of row histograms; with the programs of a fit and what it makes of them, 1 GiB
-FEWEST_FRAMES, FEWEST_ROWS, SMALL_SHARE = 2, 16, 0.25
+FEWEST_FRAMES, FEWEST_ROWS = 2, 16  # of an exposure, of a colour: before memory is saved on the others
+SMALL_SHARE = 0.25  # of MOST_MIB: up to here sharing a program is worth more than bins
 OUTLIER_SCALE, NEAR_WIDTHS = 2.0, 6.0
 SAMPLE_PIXELS = 60_000  # quantiles to half a percent of the noise
 
