@@ -44,8 +44,9 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
     """Estimate all parameters of the paper's noise model jointly.
 
     Args:
-        stack: FrameStack, a `Summary` of one, or an array [frame, row, column] or [exposure, frame, row, column]
-            with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...).
+        stack: FrameStack, a `Summary` of one, or with FrameStack's keywords (exposure_s, black_level, white_level, cfa,
+            shutter, kind, ...) an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays
+            [frame, row, column], one an exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
             not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
             together with all others (`hsnoise.synthetic`); their values are where the search starts.

@@ -30,6 +30,8 @@ CHORD_CLOSE_SIGMA = 0.1  # with the curvature of a part of the frames
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
 REFINEMENTS = 4  # of the curvature
 IDLE_BELOW = -3.0  # softplus coordinate: less than 5 % of what the data resolve
+TURNS = 3  # of rounds: two more after parameters left their bound
+OFF_BOUND, WORTH_NATS = 0.0, 0.5  # softplus coordinate: 0.7 of what the data resolve; likelihood gained there
 
 
 class Maximum(NamedTuple):
@@ -66,22 +68,29 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     pilot = _by_rounds(coordinates, every_nth_row(few, thinning))
     give_back_free_memory()
     scale = sum(summary.n_frames) / sum(few.n_frames)
-    darks, flats = _pieces(pilot.physics, summary, frames)
-    # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.
-    guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
-    _, _, whiten = _curvature(coordinates, pilot.vector, pilot.whiten / np.sqrt(thinning), guide)
-    vector, _, _, steps = _chords(pilot.vector, whiten, guide)
+    vector, whiten, iterations = pilot.vector, pilot.whiten / np.sqrt(thinning), pilot.iterations
+    for turn in range(TURNS):
+        darks, flats = _pieces(_parameters(coordinates, vector)[0], summary, frames)
+        # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.
+        guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
+        _, _, whiten = _curvature(coordinates, vector, whiten, guide)
+        if turn == 0:
+            vector, _, _, steps = _chords(vector, whiten, guide)
+            iterations += steps
+        whole = partial(_gradients_of_pieces, coordinates, [*darks, *flats], 1.0)
+        ahead, value, distance, steps = _chords(vector, whiten / np.sqrt(scale), whole)
+        iterations += steps
+        if distance < CHORD_CLOSE_SIGMA:
+            break
+        vector = ahead  # too far for one curvature: another from here
 
     def anew(point):
         parts = _pieces(_parameters(coordinates, point)[0], few, frames)
         return _gradients_of_pieces(coordinates, [*parts[0], *parts[1]], 1 / scale, point[None])
 
     information = _in_parameters(coordinates, vector, whiten, anew) * scale
-    whole = partial(_gradients_of_pieces, coordinates, [*darks, *flats], 1.0)
     whiten = whiten / np.sqrt(scale)
-    vector, value, distance, more = _chords(vector, whiten, whole)
-    iterations = pilot.iterations + steps + more
-    return _ended(coordinates, vector, whiten, information, value, iterations, distance, CHORD_CLOSE_SIGMA)
+    return _ended(coordinates, ahead, whiten, information, value, iterations, distance, CHORD_CLOSE_SIGMA)
 
 
 def _n_rows(summary: Summary) -> int:
@@ -89,13 +98,35 @@ def _n_rows(summary: Summary) -> int:
 
 
 def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
-    """Rounds of quasi-Newton steps, each from a fresh curvature and with fresh quadrature rules."""
+    """Rounds of quasi-Newton steps, each from a fresh curvature and with fresh quadrature rules.
+
+    Once more where a parameter was left at its bound of zero without need.
+    """
     light = _on_device(without_counts(summary))
     vector = eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base)
     rules = _on_device(plan_rules(coordinates.base, summary))
+    iterations = 0
+    for _ in range(TURNS):
+        vector, value, whiten, rules, steps, distance = _rounds(coordinates, vector, summary, light, rules)
+        iterations += steps
+
+        def anew(point, rules=rules):
+            own = replan(rules, plan_rules(_parameters(coordinates, point)[0], summary))
+            return _gradients(coordinates, light, _on_device(own), point[None])
+
+        ahead = _off_bounds(coordinates, vector, value, anew)
+        if (ahead == vector).all():
+            break
+        vector, rules = ahead, _on_device(replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary)))
+    information = _in_parameters(coordinates, vector, whiten, anew)
+    return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
+
+
+def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, rules):
+    """From `vector` to where the likelihood rises no more: (vector, value, whitening, rules, steps, errors left)."""
     pixels = sum(h.counts.sum(dtype=np.float64) for h in summary.histograms) + 1.0
     whiten = min(FIRST_SPREAD, FIRST_SPREAD_OF_ONE / np.sqrt(pixels)) * np.eye(len(vector))
-    value, gradient, whiten = _curvature(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
+    value, _, whiten = _curvature(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
     iterations, distance = 0, np.inf
     for _ in range(ROUNDS):
         ahead, steps = quasi_newton(coordinates, vector, whiten, coordinates.reach(vector), value, light, rules)
@@ -112,13 +143,21 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
         vector = ahead
         if distance < CLOSE_SIGMA:
             break
+    return vector, value, whiten, rules, iterations, distance
 
-    def anew(point):
-        own = replan(rules, plan_rules(_parameters(coordinates, point)[0], summary))
-        return _gradients(coordinates, light, _on_device(own), point[None])
 
-    information = _in_parameters(coordinates, vector, whiten, anew)
-    return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
+def _off_bounds(coordinates, vector, value, gradient_anew) -> np.ndarray:
+    """`vector`, with parameters taken off their bound of zero where the likelihood is higher above it.
+
+    At the bound it is flat in their coordinates, whether it rises beyond or not: a search that once got there stays.
+    """
+    ahead = np.array(vector)
+    for i in coordinates.bounded:
+        end = np.array(vector)
+        end[i] = OFF_BOUND
+        if vector[i] < IDLE_BELOW and gradient_anew(end)[0][0] > value + WORTH_NATS:
+            ahead[i] = OFF_BOUND
+    return ahead
 
 
 def _on_device(tree):
@@ -162,16 +201,22 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
 
 
 def _chords(vector, whiten, gradients):
-    """Newton steps with the curvature that `whiten` tells: (vector, value, standard errors left, steps)."""
-    best, steps = (vector, -np.inf, np.inf), 0
+    """Newton steps with the curvature that `whiten` tells: (vector, value, standard errors left, steps).
+
+    A step that leads down, and farther away, is tried again at a quarter of its length.
+    """
+    best, ahead, length, steps = (vector, -np.inf, np.inf), vector, 1.0, 0
     while True:
-        (value,), (gradient,) = gradients(vector[None])
+        (value,), (gradient,) = gradients(ahead[None])
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
-        best = (vector, float(value), distance) if distance < best[2] else best
-        if distance < CLOSE_SIGMA or distance > 2 * best[2] or steps == CHORDS:
+        if np.isfinite(distance) and (value > best[1] or distance < best[2]):
+            best, step, length = (ahead, float(value), distance), whiten @ (whiten.T @ gradient), 1.0
+        else:
+            length /= 4
+        if best[2] < CLOSE_SIGMA or not np.isfinite(best[2]) or steps == CHORDS:
             return *best, steps
         steps += 1
-        vector = vector + whiten @ (whiten.T @ gradient)
+        ahead = best[0] + length * step
 
 
 @eqx.filter_jit

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from benchmarks import simulator
 from hsnoise import maximise as maximise_module
 from hsnoise import statistics
 from hsnoise.model import sample_dark
-from hsnoise.moments import _of_one_rate
+from hsnoise.moments import _of_one_rate, start_physics
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 FRAMES, SHAPE = 4, (96, 128)
@@ -234,6 +235,21 @@ def test_frames_that_saw_light_are_called_flats():
     ]
     stack = hsnoise.FrameStack(light, bright.exposure_s, black_level=64, cfa="RGGB", shutter="global")
     assert any("pass kind='flat'" in note for note in hsnoise.fit(stack).notes)
+
+
+def test_a_row_gain_that_starts_at_zero_leaves_it(monkeypatch):
+    # A row gain of zero is a stationary point, whatever the frames say.
+    def start_at_zero(summary, with_row_gain, with_clamp):
+        start = start_physics(summary, with_row_gain, with_clamp)
+        return eqx.tree_at(lambda p: p.row_sigma, start, start.row_sigma * np.array([1.0, 1.0, 1e-6]))
+
+    model = hsnoise.cameras.canon_5d3(black_level_dn=64)
+    stack = capture(model)
+    usual = hsnoise.fit(stack)
+    monkeypatch.setattr(importlib.import_module("hsnoise.fit"), "start_physics", start_at_zero)
+    result = hsnoise.fit(stack)
+    assert_recovered(result, model)
+    assert abs(result.log_likelihood - usual.log_likelihood) < 0.05
 
 
 def not_converged(coordinates, summary):
