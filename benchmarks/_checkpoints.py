@@ -40,20 +40,30 @@ def write(folder: Path, step: int, tree: Any, about: dict[str, Any]) -> Path:
 def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]] | None:
     """Tree and description of the newest checkpoint that is whole; None if there is none.
 
+    A first one, before which there is nothing, may be cut off: then the run begins anew, and that is said.
+
     Raises:
-        ValueError: there are checkpoints, and none can be read.
+        ValueError: there are several checkpoints, and none can be read.
     """
     found, damaged = checkpoints(folder), []
     for path in found:
         try:
             result = read_arrays(path, like)
         except ValueError as error:
-            say(f"{error}; taking the one before" if path != found[-1] else f"{error}")
+            instead = "taking the one before" if path != found[-1] else "there is none before it"
+            say(f"{error}; {instead}")
             damaged.append(path)
             continue
-        for one in damaged:  # else it would count as one of the last two
-            one.rename(one.with_suffix(".damaged"))
+        set_aside(damaged)
         return result
-    if found:
+    if len(found) == 1:
+        set_aside(damaged)
+    elif found:
         raise ValueError(f"{folder}: none of its {len(found)} checkpoints can be read; remove them to start anew")
     return None
+
+
+def set_aside(damaged: list[Path]) -> None:
+    """Rename them: else they would count as the last two."""
+    for path in damaged:
+        path.rename(path.with_suffix(".damaged"))

@@ -12,7 +12,8 @@ from hsnoise.video import frames_of, is_clip
 
 HELD_OUT_EVERY = 4
 LONG = "_long"  # name of a longer cut of the same video ends so
-STILLS = ("astronaut", "chelsea", "coffee", "hubble_deep_field", "immunohistochemistry", "retina", "rocket")
+STILLS = {"astronaut": "astronaut", "cells": "immunohistochemistry", "chelsea": "chelsea", "coffee": "coffee"}
+STILLS |= {"deep_field": "hubble_deep_field", "retina": "retina", "rocket": "rocket"}  # the fourth is held out
 MOVING_FRAMES, MOVING_CROP = 12, 192
 FASTEST = 3.0  # pixels a frame
 MOST_FRAMES = 300  # of a clip: longer videos are cut, they would not fit into memory
@@ -41,12 +42,13 @@ def read_clips(folder: Path | None) -> list[Clip]:
         return moving_stills()
     if not folder.is_dir():
         raise ValueError(f"--clips: expected a folder, got {folder}")
-    paths = [path for path in sorted(folder.iterdir()) if is_clip(path)]
+    # Hidden files are other programs' own, such as the ._name beside each file of some discs.
+    paths = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and is_clip(path)]
     if not paths and is_clip(folder):
         paths = [folder]
     if not paths:
         raise ValueError(f"--clips: found no videos, folders of images or .npz files in {folder}")
-    return [Clip(path.stem, _first_frames(path)) for path in paths]
+    return [Clip(path.name if path.is_dir() else path.stem, _first_frames(path)) for path in paths]
 
 
 def _first_frames(path: Path) -> np.ndarray:
@@ -92,8 +94,8 @@ def moving_stills(seed: int = 0) -> list[Clip]:
 
     rng = np.random.default_rng(seed)
     clips = []
-    for name in STILLS:
-        picture = np.asarray(getattr(skimage.data, name)())
+    for name, loader in STILLS.items():
+        picture = np.asarray(getattr(skimage.data, loader)())
         clips.append(Clip(f"still_{name}", _moved(picture, rng)))
     return clips
 

@@ -20,6 +20,7 @@ from hsnoise.photometry import GREY
 
 JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
+LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons of white, or lux
 NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
 
 
@@ -52,41 +53,77 @@ OPTICS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera to train for: its noise, and the photoelectrons of white in dim and in bright scenes."""
+    """A camera to train for: its noise, photoelectrons of white in dim and in bright scenes, its optics if known."""
 
     name: str
     model: NoiseModel
     white_e: tuple[float, float]
+    optics: Optics | None = None
 
     @property
     def channels(self) -> int:
         return len(self.model.channels)
 
+    def in_words(self, white_e: float) -> str:
+        """The light of a scene in which white has so many photoelectrons."""
+        return f"{white_e:.2g} e-" if self.optics is None else f"{white_e / float(self.optics.white_e(1.0)):.2g} lux"
 
-def camera_of(name: str, lux: tuple[float, float] | None, white_e: tuple[float, float] | None) -> Camera:
-    """A built-in camera, or that of a model.json.
+
+def camera_of(
+    name: str,
+    lux: tuple[float, float] | None,
+    white_e: tuple[float, float] | None,
+    exposure_s: float | None = None,
+) -> Camera:
+    """A built-in camera, or that of a model.json with this exposure of a video frame (default: the model's own).
 
     Raises:
-        ValueError: an unknown camera or file; light that is missing, given twice or not above 0.
+        ValueError: an unknown camera or file; light that is missing, given twice or out of range; an exposure that is
+            not above 0, or goes with a built-in camera, which has its own.
     """
+    if lux is not None and white_e is not None:
+        raise ValueError(f"--lux, --white-e: both say how much light there is; expected one, got {lux} and {white_e}")
     if name in OPTICS:
-        model, optics = getattr(hsnoise.cameras, name)(), OPTICS[name]
-        if white_e is None:
-            low, high = lux or optics.lux
-            white_e = float(optics.white_e(low)), float(optics.white_e(high))
-    elif Path(name).is_file():
-        if lux is not None or white_e is None:
-            raise ValueError("--white-e: needed with a model.json, which does not tell the optics that --lux needs")
-        model = NoiseModel.load(name)
-    else:
+        if exposure_s is not None:
+            raise ValueError(f"--exposure: goes with a model.json; {name} has {OPTICS[name].exposure_s:g} s")
+        return _built_in(name, lux, white_e)
+    if not Path(name).is_file():
         raise ValueError(f"--camera: expected a model.json or one of {', '.join(OPTICS)}, got {name}")
-    if not 0 < white_e[0] <= white_e[1]:
-        raise ValueError(f"--lux, --white-e: expected low, high above 0, got {white_e[0]:g}, {white_e[1]:g}")
-    return Camera(Path(name).stem, model, white_e)
+    model = NoiseModel.load(name)
+    if lux is not None or white_e is None:
+        raise ValueError("--white-e: needed with a model.json, which does not tell the optics that --lux needs")
+    if exposure_s is not None:
+        if not 0 < exposure_s < np.inf:
+            raise ValueError(f"--exposure: expected seconds above 0, got {exposure_s:g}")
+        model = at_exposure(model, exposure_s)
+    return Camera(Path(name).stem, model, checked_light("--white-e", white_e))
+
+
+def _built_in(name: str, lux: tuple[float, float] | None, white_e: tuple[float, float] | None) -> Camera:
+    model, optics = getattr(hsnoise.cameras, name)(), OPTICS[name]
+    if white_e is None:
+        low, high = checked_light("--lux", lux or optics.lux)
+        white_e = float(optics.white_e(low)), float(optics.white_e(high))
+    return Camera(name, model, checked_light("--white-e", white_e), optics)
+
+
+def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float]:
+    """Raise ValueError unless it is a range of light that a camera may see."""
+    low, high = light
+    if not LEAST_LIGHT <= low <= high <= MOST_LIGHT:
+        raise ValueError(f"{option}: expected low,high from {LEAST_LIGHT:g} to {MOST_LIGHT:g}, got {low:g},{high:g}")
+    return light
+
+
+def at_exposure(model: NoiseModel, exposure_s: float) -> NoiseModel:
+    """`model` with this exposure where none is given, s."""
+    return NoiseModel(model.effects, cfa=model.cfa, shutter=model.shutter, exposure_s=exposure_s)
 
 
 def noise_of(kind: str, camera: Camera) -> NoiseModel:
     """The noise to train on: the camera's own, a simpler one of the same strength, or that of a model.json.
+
+    All at the camera's exposure.
 
     Raises:
         ValueError: an unknown noise, or a model of other channels than the camera's.
@@ -100,26 +137,27 @@ def noise_of(kind: str, camera: Camera) -> NoiseModel:
     model = NoiseModel.load(kind)
     if model.cfa != camera.model.cfa:
         raise ValueError(f"--noise: {kind} is a model of cfa {model.cfa}, the camera's is {camera.model.cfa}")
-    return model
+    return at_exposure(model, camera.model.exposure_s)
 
 
 def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: float | None = None) -> NoiseModel:
     """Independent noise of the same variance in each pixel: that of the model's frames, or of `dark_variance_e2`.
 
     "poisson-gaussian": shot noise, and read noise that makes up the variance of darks (so that variance against mean
-    is the same line). "gaussian": one variance for all, that at `light_e` photoelectrons.
+    is the same line, but for what row gain adds with the square of the light). "gaussian": one variance for all, that
+    at `light_e` photoelectrons.
     """
     light_e = light_e if kind == "gaussian" else 0.0
     variance_e2 = _variance_e2(model, light_e) if dark_variance_e2 is None else dark_variance_e2 + light_e
     rate = model["dark_current"].rate if "dark_current" in model else jnp.zeros(())
     dark_e = float(rate) * model.exposure_s
+    clamp = np.asarray(model["black_clamp"].rate) * model.exposure_s if "black_clamp" in model else 0.0
+    black_level = black_level_of(model) - clamp
     if kind == "poisson-gaussian":
         effects = [ShotNoise(), DarkCurrent(rate), ReadNoise(float(np.sqrt(max(variance_e2 - dark_e, 1e-6))))]
-        black_level = black_level_of(model)
     else:
         effects = [ReadNoise(float(np.sqrt(variance_e2)))]
-        clamp = np.asarray(model["black_clamp"].rate) * model.exposure_s if "black_clamp" in model else 0.0
-        black_level = black_level_of(model) + np.asarray(model["gain"].value) * dark_e - clamp
+        black_level = black_level + np.asarray(model["gain"].value) * dark_e
     effects += [model["gain"], BlackLevel(jnp.asarray(black_level)), *([model["adc"]] if "adc" in model else [])]
     return NoiseModel(effects, cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
 

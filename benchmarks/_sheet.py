@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 
 @dataclass(frozen=True)
@@ -16,13 +18,13 @@ class Sheet:
     rows: list[tuple[str, ...]] = field(default_factory=list)
     left: int = 1
 
-    def rich(self) -> Table:
-        table = Table(title=self.title, title_justify="left")
+    def rich(self) -> Group:
+        table = Table()
         for i, heading in enumerate(self.headings):
             table.add_column(heading, justify="left" if i < self.left else "right")
         for row in self.rows:
             table.add_row(*row)
-        return table
+        return Group(Text(self.title, style="italic"), table)  # Table's own title is wrapped to the table's width
 
     def markdown(self) -> str:
         rule = ["---" if i < self.left else "---:" for i in range(len(self.headings))]

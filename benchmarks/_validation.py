@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
-from PIL import Image
+from matplotlib.figure import Figure
 
 from benchmarks._clips import Clip
 from benchmarks._noisy import Camera, noisy_of
-from hsnoise._output import write_atomically
-from hsnoise.photometry import display_from_linear, frames_of_display, light_of_frames
+from hsnoise._output import write_figure
+from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.stlstm import STLSTM
 
 CROP = 96
@@ -32,6 +31,7 @@ class Validation:
     def __init__(self, clips: Sequence[Clip], camera: Camera, frames: int, out: Path):
         self.out, self.last = out, float("nan")
         white_e = float(np.sqrt(np.prod(camera.white_e)))
+        self.names = [clip.name for clip in clips[:MOST_CLIPS]]
         clean, noisy = [], []
         side = min(CROP, *(n // 2 * 2 for clip in clips for n in clip.frames.shape[1:3]))
         frames = min(frames, *(len(clip.frames) for clip in clips))
@@ -49,10 +49,20 @@ class Validation:
         enhanced = np.asarray(self._video(net, self.noisy))
         values = [psnr_db(enhanced[:, i], self.clean[:, i]) for i in range(enhanced.shape[1])]
         self.last = float(np.mean(values))
-        rows = [np.asarray(display_from_linear(self.noisy[-1])), enhanced[-1], self.clean[-1]]
-        picture = np.concatenate([np.concatenate(list(row), 1) for row in rows], 0)
-        pixels = frames_of_display(picture)
-        buffer = io.BytesIO()
-        Image.fromarray(pixels.squeeze()).save(buffer, "PNG")
-        write_atomically(self.out / f"validation-{step:08d}.png", buffer.getvalue())
+        write_figure(self.out / f"validation-{step:08d}.png", self._picture(enhanced[-1], step), dpi=100)
         return self.last
+
+    def _picture(self, enhanced: np.ndarray, step: int) -> Figure:
+        """The last frame of each clip: noisy, enhanced, clean."""
+        columns = {"noisy": np.asarray(display_from_linear(self.noisy[-1])), "enhanced": enhanced}
+        columns["clean"] = self.clean[-1]
+        figure = Figure(figsize=(8.4, 2.9 * len(enhanced) + 0.3), layout="constrained")
+        figure.suptitle(f"Step {step}: last frame of held-out clips", fontsize=11)
+        axes = figure.subplots(len(enhanced), 3, squeeze=False)
+        for j, (name, frames) in enumerate(columns.items()):
+            for i, (axis, frame) in enumerate(zip(axes[:, j], frames, strict=True)):
+                value = self.names[i] if name == "clean" else f"{psnr_db(frame, self.clean[-1, i]):.1f} dB"
+                axis.set_title(f"{name}, {value}", fontsize=10, loc="left")
+                axis.imshow(np.clip(frame, 0, 1).squeeze(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+                axis.axis("off")
+        return figure

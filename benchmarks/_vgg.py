@@ -25,34 +25,44 @@ def read_weights(path: Path) -> tuple[dict[str, np.ndarray], str]:
     """State dict of torchvision's VGG-16 (.safetensors, or .pth, which needs torch), and SHA-256 of the file.
 
     Raises:
-        ValueError: an unknown format, or arrays that are missing or of other shapes.
+        ValueError: an unknown format, a file that cannot be read, or arrays that are missing, of other shapes or not
+            finite.
         ImportError: the library that reads the format is not installed.
     """
     if not path.is_file():
         raise ValueError(f"--vgg: there is no file {path}")
-    if path.suffix == ".safetensors":
-        from safetensors import SafetensorError
-        from safetensors.numpy import load_file
-
-        try:
-            state = load_file(path)
-        except SafetensorError as error:
-            raise ValueError(f"--vgg: {path} cannot be read ({error})") from error
-    elif path.suffix in (".pth", ".pt"):
-        import torch
-
-        state = {name: value.numpy() for name, value in torch.load(path, map_location="cpu", weights_only=True).items()}
-    else:
+    if path.suffix not in (".safetensors", ".pth", ".pt"):
         raise ValueError(f"--vgg: expected a .safetensors or .pth file, got {path}")
+    shapes = {}
     for place, inputs, outputs in LAYERS:
-        for name, shape in (
-            (f"features.{place}.weight", (outputs, inputs, 3, 3)),
-            (f"features.{place}.bias", (outputs,)),
-        ):
-            found = state[name].shape if name in state else "nothing"
-            if found != shape:
-                raise ValueError(f"--vgg: {path}: expected {name} of shape {shape}, got {found}")
+        shapes |= {f"features.{place}.weight": (outputs, inputs, 3, 3), f"features.{place}.bias": (outputs,)}
+    try:
+        state = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+        state = {name: np.asarray(state[name], np.float32) for name in shapes if name in state}
+    except ImportError:
+        raise
+    except Exception as error:  # pickles and archives fail in as many ways as they have bytes
+        raise ValueError(f"--vgg: {path} cannot be read ({type(error).__name__}: {error})") from error
+    for name, shape in shapes.items():
+        found = state[name].shape if name in state else "nothing"
+        if found != shape:
+            raise ValueError(f"--vgg: {path}: expected {name} of shape {shape}, got {found}")
+        if not np.isfinite(state[name]).all():
+            raise ValueError(f"--vgg: {path}: expected finite numbers in {name}, got NaN or infinite ones")
     return state, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
+    from safetensors.numpy import load_file
+
+    return load_file(path)
+
+
+def _read_pickle(path: Path) -> dict[str, np.ndarray]:
+    import torch
+
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    return {name: value.detach().float().numpy() for name, value in state.items() if str(name).startswith("features.")}
 
 
 def features_of(state: dict[str, np.ndarray]) -> Callable[[jax.Array], jax.Array]:

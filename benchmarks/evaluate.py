@@ -9,6 +9,8 @@ and BM4D take part if the extra `peers` is installed; BM4D over the frame axis s
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +27,12 @@ from benchmarks._clips import LONG, Clip, check_sizes, held_out, read_clips
 from benchmarks._noisy import OPTICS, Camera, camera_of, noisy_of
 from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._sheet import Sheet
+from benchmarks._training import digest_of
 from benchmarks._validation import psnr_db
 from benchmarks.train import pair
 from hsnoise._output import write_atomically, write_figure
 from hsnoise.photometry import display_from_linear, light_of_frames, linear_from_display
+from hsnoise.stlstm import STLSTM
 from hsnoise.weights import load_network
 
 LEVELS = 3
@@ -77,22 +81,34 @@ def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
     ]
 
 
-def network_of(path: Path, camera: Camera, scored: Sequence[Clip]):
-    """The enhancer as a function of noisy linear light [frame, example, row, column, channel].
+def camera_for(about: dict, options: argparse.Namespace) -> Camera:
+    """The camera and light to score with: those that the options say, else those that the weights were trained for.
 
     Raises:
-        ValueError: weights of another number of channels, or trained on clips that are to be scored.
+        ValueError: weights for a camera of which only its file would tell; else as `camera_of`.
     """
-    net, about = load_network(path)
+    name = options.camera or about.get("camera")
+    if options.camera is None and name not in OPTICS:
+        raise ValueError(f"--camera: the weights were trained for {name}, which is not built in; give its model.json")
+    white_e = options.white_e
+    if white_e is None and options.lux is None and "white_e" in about:
+        white_e = tuple(about["white_e"])
+    camera = camera_of(name, options.lux, white_e, options.exposure)
+    if about.get("digests", {}).get("camera") != digest_of(camera.model):
+        print(f"Note: {options.weights} was trained for another camera ({about.get('camera')}) than {camera.name}")
+    return camera
+
+
+def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: Sequence[Clip]) -> None:
+    """Raise ValueError for weights of another number of channels, or trained on clips that are to be scored."""
     if net.channels != camera.channels:
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
-    seen = sorted({clip.source for clip in scored} & {name.removesuffix(LONG) for name in about.get("clips", ())})
+    if "clips" not in about:
+        print(f"Note: {path} does not say which clips it was trained on; those scored may be among them")
+    names, digests = ({n.removesuffix(LONG) for n in about.get("clips", ())}, about.get("trained_on", ()))
+    seen = sorted({clip.source for clip in scored if clip.source in names or digest_of(clip.frames) in digests})
     if seen:
         raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
-    if about.get("camera") != camera.name:
-        print(f"Note: {path} was trained for camera {about.get('camera')}, not {camera.name}")
-    video = eqx.filter_jit(net.video)
-    return lambda noisy: np.asarray(video(noisy))
 
 
 def while_memory_fills(net, scene: Scene) -> list[float]:
@@ -129,22 +145,35 @@ def mean_of(records: Sequence[dict], what: str, **chosen) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def tables(records: list[dict], unit_of_light) -> tuple[Sheet, Sheet]:
+def tables(records: list[dict], in_words) -> tuple[Sheet, Sheet]:
     """PSNR and SSIM of each method, all and at each illuminance; PSNR of each clip."""
     methods, levels = list(dict.fromkeys(r["method"] for r in records)), sorted({r["white_e"] for r in records})
-    head = ("method", "PSNR / dB", "SSIM", *(f"PSNR at {unit_of_light(level)}" for level in levels))
+    head = ("method", "PSNR / dB", "SSIM", *(f"dB / SSIM at {in_words(level)}" for level in levels))
     rows = [
         (
             method,
             f"{mean_of(records, 'psnr_db', method=method):.2f}",
             f"{mean_of(records, 'ssim', method=method):.3f}",
-            *(f"{mean_of(records, 'psnr_db', method=method, white_e=level):.2f}" for level in levels),
+            *(
+                f"{mean_of(records, 'psnr_db', method=method, white_e=level):.2f} /"
+                f" {mean_of(records, 'ssim', method=method, white_e=level):.3f}"
+                for level in levels
+            ),
         )
         for method in methods
     ]
     clips = list(dict.fromkeys(r["clip"] for r in records))
     by_clip = [(clip, *(f"{mean_of(records, 'psnr_db', method=m, clip=clip):.2f}" for m in methods)) for clip in clips]
     return Sheet("Held-out clips", head, rows), Sheet("PSNR of each clip, dB", ("clip", *methods), by_clip)
+
+
+def as_csv(records: list[dict]) -> str:
+    """All that was measured, a line for each frame."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, records[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return file.getvalue()
 
 
 def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
@@ -155,16 +184,16 @@ def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
     return Sheet(title, ("clip", *(f"n = {n}" for n in shown)), rows)
 
 
-def draw_curves(records: list[dict], filling: dict[str, list[float]], unit_of_light) -> Figure:
+def draw_curves(records: list[dict], filling: dict[str, list[float]], in_words) -> Figure:
     """PSNR against illuminance (all methods) and against the number of frames that the network has seen."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     levels = sorted({r["white_e"] for r in records})
-    for method in dict.fromkeys(r["method"] for r in records):
+    for method, marker in zip(dict.fromkeys(r["method"] for r in records), "sovDXP", strict=False):
         values = [mean_of(records, "psnr_db", method=method, white_e=level) for level in levels]
-        left.plot(levels, values, "o-", lw=2.5 if method == OURS else 1.2, label=method)
+        left.plot(levels, values, f"{marker}-", alpha=0.8, lw=2.5 if method == OURS else 1.2, label=method)
     left.set_xscale("log")
-    left.set_xticks(levels, [unit_of_light(level) for level in levels])
+    left.set_xticks(levels, [in_words(level) for level in levels])
     left.minorticks_off()
     left.set_xlabel("light of the scene")
     left.set_ylabel("PSNR (dB)")
@@ -179,13 +208,14 @@ def draw_curves(records: list[dict], filling: dict[str, list[float]], unit_of_li
     return figure
 
 
-def draw_frames(scene: Scene, found: dict[str, np.ndarray]) -> Figure:
-    """The last frame of a scene by all methods."""
+def draw_frames(scene: Scene, found: dict[str, np.ndarray], light: str) -> Figure:
+    """The last frame of a scene by all methods; light: of the scene, in words."""
     panels = {**found, "clean": scene.clean}
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
     aspect = scene.clean.shape[1] / scene.clean.shape[2]
-    figure = Figure(figsize=(3.2 * columns, (3.2 * aspect + 0.35) * rows), layout="constrained")
+    figure = Figure(figsize=(3.2 * columns, (3.2 * aspect + 0.35) * rows + 0.35), layout="constrained")
+    figure.suptitle(f"{scene.clip}, {light}, frame {len(scene.clean)}: PSNR of this frame", fontsize=11)
     axes = np.ravel(figure.subplots(rows, columns))
     for axis in axes:
         axis.axis("off")
@@ -199,14 +229,15 @@ def draw_frames(scene: Scene, found: dict[str, np.ndarray]) -> Figure:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("weights", type=Path)
+    add("weights", type=Path, help="weights.eqx of a training")
     add("--clips", type=Path, help="the folder that it was trained with; the clips held out then are used")
-    add("--camera", default="canon_5d3", help=f"model.json of a fit, or {', '.join(OPTICS)}")
-    add("--lux", type=pair)
-    add("--white-e", type=pair)
+    add("--camera", help=f"model.json of a fit, or {', '.join(OPTICS)} (default: the built-in one trained for)")
+    add("--lux", type=pair, help="illuminance of the scene: low,high (default: that of the training)")
+    add("--white-e", type=pair, help="or photoelectrons of white: low,high")
+    add("--exposure", type=float, help="of a video frame, s, with a model.json (default: the model's own)")
     add("--crop", type=int, default=160, help="side of the middle of each frame that is scored (default 160)")
     add("--no-rivals", action="store_true", help="score the enhancer and the scaled input only")
-    add("--out", type=Path, default=Path("build/evaluate"))
+    add("--out", type=Path, default=Path("build/evaluate"), help="default: build/evaluate")
     options = parser.parse_args(argv)
     try:
         evaluate(options)
@@ -218,18 +249,19 @@ def evaluate(options: argparse.Namespace) -> None:
     if options.crop < LEAST_CROP:
         raise ValueError(f"--crop: expected at least {LEAST_CROP} pixels, as SSIM needs, got {options.crop}")
     options.out.mkdir(parents=True, exist_ok=True)
-    camera = camera_of(options.camera, options.lux, options.white_e)
+    network, about = load_network(options.weights)
+    camera = camera_for(about, options)
     train, kept = held_out(read_clips(options.clips))
     check_sizes([*train, *kept], LEAST_FRAMES, LEAST_CROP)
     levels = np.geomspace(*camera.white_e, LEVELS)
-    net = network_of(options.weights, camera, kept)
+    check_weights(options.weights, network, about, camera, kept)
+    video = eqx.filter_jit(network.video)
+
+    def net(noisy: np.ndarray) -> np.ndarray:
+        return np.asarray(video(noisy))
+
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
-    lux = OPTICS.get(camera.name)
-
-    def unit_of_light(white_e: float) -> str:
-        return f"{white_e:.2g} e-" if lux is None else f"{white_e / float(lux.white_e(1.0)):.2g} lux"
-
     short = [clip for clip in kept if not clip.name.endswith(LONG)]
     tasks = [(clip, float(level)) for clip in short for level in levels]
     records = []
@@ -238,18 +270,24 @@ def evaluate(options: argparse.Namespace) -> None:
         found = {name: method(scene) for name, method in methods.items()}
         records += [row for name, frames in found.items() for row in scores(name, scene, frames)]
         if level == middle:
-            write_figure(options.out / f"frames-{clip.name}.png", draw_frames(scene, found), dpi=110)
+            write_figure(
+                options.out / f"frames-{clip.name}.png", draw_frames(scene, found, camera.in_words(level)), dpi=110
+            )
     # Without longer cuts, the clips themselves show how the memory fills.
     filling = {}
     for number, clip in enumerate([c for c in kept if c.name.endswith(LONG)] or short):
         filling[clip.name] = while_memory_fills(net, scene_of(clip, camera, middle, options.crop, 1000 + number))
-    sheets = (*tables(records, unit_of_light), memory_sheet(filling))
+    sheets = (*tables(records, camera.in_words), memory_sheet(filling))
     for sheet in (sheets[0], sheets[-1]):
-        Console(width=130).print(sheet.rich())
-    write_atomically(options.out / "evaluation.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
-    curves = draw_curves(records, filling, unit_of_light)
+        Console(width=150).print(sheet.rich())
+    light = f"{camera.in_words(levels[0])} to {camera.in_words(levels[-1])}"
+    title = f"{options.weights}: camera {camera.name}, {light}, the middle {options.crop} pixels of each frame\n"
+    text = "\n".join([title, *(sheet.markdown() for sheet in sheets)])
+    write_atomically(options.out / "evaluation.md", text.encode())
+    write_atomically(options.out / "frames.csv", as_csv(records).encode())
+    curves = draw_curves(records, filling, camera.in_words)
     write_figure(options.out / "curves.png", curves, dpi=110)
-    print(f"Written to {options.out}: evaluation.md, curves.png, frames-*.png")
+    print(f"Written to {options.out}: evaluation.md, frames.csv, curves.png, frames-*.png")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from rich.progress import track
 
 import hsnoise
 from benchmarks._clips import LONG, Clip, check_sizes, crops, held_out, read_clips
-from benchmarks._noisy import Camera, matched
+from benchmarks._noisy import Camera, at_exposure, matched
 from benchmarks._sheet import Sheet
 from benchmarks._training import Recipe, Trainer, batch_rng, digest_of
 from benchmarks._validation import psnr_db
@@ -136,10 +136,6 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
     return {name: NoiseModel.load(path) for name, path in paths.items()}
 
 
-def at_exposure(params: NoiseModel, exposure_s: float) -> NoiseModel:
-    return NoiseModel(params.effects, cfa=params.cfa, shutter=params.shutter, exposure_s=exposure_s)
-
-
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], options.stride, options.side)[:8]
@@ -152,7 +148,8 @@ def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, opti
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
         batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, options.side)
         state, value = trainer.step(state, batch, seed, step)
-    save_network(path, trainer.network(state), {"camera": camera.name, "noise": name, "steps": options.steps})
+    about = {"camera": camera.name, "noise": name, "steps": options.steps, "clips": [clip.name for clip in clips]}
+    save_network(path, trainer.network(state), about)
     print(f"{text}: loss {float(value):.4f}", flush=True)
     return path
 
@@ -214,11 +211,15 @@ def gain_of(apart: list[dict[str, float]]) -> tuple[float, float]:
     """Mean of differences {clip: dB} of several seeds, and its standard error: over clips, or seeds if that is more.
 
     Seeds hold out other clips, so that the scatter between clips is in both; that between trainings is in the second.
+    Where more seeds repeat the clips, the scatter between clips is in the first alone: both are added.
     """
     of_clips = [[of[clip] for of in apart if clip in of] for clip in sorted({clip for of in apart for clip in of})]
     of_seeds = [list(of.values()) for of in apart]
     errors = [standard_error([float(np.mean(values)) for values in groups]) for groups in (of_clips, of_seeds)]
-    return float(np.mean([value for of in of_seeds for value in of])), max(errors)
+    repeated = any(len(values) > 1 for values in of_clips)
+    return float(np.mean([value for of in of_seeds for value in of])), float(np.hypot(*errors)) if repeated else max(
+        errors
+    )
 
 
 def standard_error(means: Sequence[float]) -> float:
@@ -229,21 +230,23 @@ def standard_error(means: Sequence[float]) -> float:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--clips", type=Path)
-    add("--sensors", default="imx541,stl1001,tc237")
-    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out other clips")
-    add("--steps", type=int, default=2000)
-    add("--maps", type=int, default=12)
-    add("--stride", type=int, default=2, help="pixels of a block of the network: four see twice as far along a row")
-    add("--side", type=int, default=32, help="of the pieces to train on, pixels")
-    add("--places", type=int, default=3, help="on the sensor, for each clip")
-    add("--out", type=Path, default=Path("build/ablation"))
+    add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
+    add("--sensors", default="imx541,stl1001,tc237", help="default: imx541,stl1001,tc237")
+    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out other clips (default: 4)")
+    add("--steps", type=int, default=2000, help="of each training (default: 2000)")
+    add("--maps", type=int, default=12, help="of the network (default: 12)")
+    add("--stride", type=int, default=2, help="pixels of a block of the network: 4 see twice as far (default: 2)")
+    add("--side", type=int, default=32, help="of the pieces to train on, pixels (default: 32)")
+    add("--places", type=int, default=3, help="on the sensor, for each clip (default: 3)")
+    add("--out", type=Path, default=Path("build/ablation"), help="default: build/ablation")
     options = parser.parse_args(argv)
     folder = Path(os.environ.get("HSNOISE_SHARED", "../shared")) / "data"
     known, asked = sensors(folder), options.sensors.split(",")
     if not folder.is_dir() or set(asked) - set(known):
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
-    for option in ("seeds", "steps", "maps", "stride", "side", "places"):
+    if options.seeds < 2:
+        parser.error(f"--seeds: expected at least 2, as trainings scatter, too; got {options.seeds}")
+    for option in ("steps", "maps", "stride", "side", "places"):
         if getattr(options, option) < 1:
             parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")
     try:

@@ -103,7 +103,7 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
     Once more where a parameter was left at its bound of zero without need.
     """
     light = _on_device(without_counts(summary))
-    vector = eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base)
+    vector = np.asarray(eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base))
     rules = _on_device(plan_rules(coordinates.base, summary))
     iterations = 0
     for _ in range(TURNS):
