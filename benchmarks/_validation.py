@@ -57,7 +57,7 @@ class Validation:
         columns = {"noisy": np.asarray(display_from_linear(self.noisy[-1])), "enhanced": enhanced}
         columns["clean"] = self.clean[-1]
         figure = Figure(figsize=(8.4, 2.9 * len(enhanced) + 0.3), layout="constrained")
-        figure.suptitle(f"Step {step}: last frame of held-out clips", fontsize=11)
+        figure.suptitle(f"Step {step}: last frame of held-out clips", x=0.01, ha="left", fontsize=11)
         axes = figure.subplots(len(enhanced), 3, squeeze=False)
         for j, (name, frames) in enumerate(columns.items()):
             for i, (axis, frame) in enumerate(zip(axes[:, j], frames, strict=True)):

@@ -50,8 +50,8 @@ class Preset:
 
 
 PRESETS = {
-    "smoke": Preset(120, 2, 4, 32, 60, Recipe(maps=8)),
     # In this little light details of less than 4 pixels are lost: coarse blocks see four times the scene in the time.
+    "smoke": Preset(200, 4, 4, 64, 100, Recipe(maps=8, stride=4, rate=5e-3)),
     "cpu": Preset(4_400, 4, 12, 64, 500, Recipe(maps=16, stride=4, rate=2e-3)),
     "paper": Preset(100_000, 8, 8, 64, 1000, Recipe(maps=64, decay=False)),
 }
