@@ -8,6 +8,7 @@ from itertools import chain
 import numpy as np
 
 from hsnoise.physics import flat_variance
+from hsnoise.profile import WEAK
 from hsnoise.result import FitResult
 from hsnoise.statistics import RowHistograms
 
@@ -44,6 +45,8 @@ def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | 
     if parameter == "gain" and relative > UNDETERMINED:
         known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
         return f"{name} is not determined{known}: add flats, or darks of longer exposures."
+    if parameter == "gain" and relative > WEAK:
+        return f"{name} is known to {relative:.0%} only, with read noise and dark current: add flats, or longer darks."
     if parameter == "read_noise.sigma" and relative > UNDETERMINED:
         in_dn = value * float(np.mean(result.physics.gain))
         return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
