@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks._noisy import Camera, jittered, noisy_of
+from benchmarks._noisy import JITTER, Camera, jittered, noisy_of
 from hsnoise import NoiseModel
 from hsnoise._keys import named_key
 from hsnoise.photometry import display_from_linear, light_of_frames
@@ -50,7 +50,13 @@ class Trainer:
     """A network, its optimiser, and the jitted step; the state is (arrays of the network, of the optimiser)."""
 
     def __init__(
-        self, recipe: Recipe, steps: int, camera: Camera, noise: NoiseModel, perceptual: Callable | None = None
+        self,
+        recipe: Recipe,
+        steps: int,
+        camera: Camera,
+        noise: NoiseModel,
+        perceptual: Callable | None = None,
+        jitter: float = JITTER,
     ):
         # Fits are in double precision, training is not.
         single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
@@ -58,7 +64,8 @@ class Trainer:
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        self._step = eqx.filter_jit(partial(_step, self.optimiser, perceptual, recipe.checkpoint), donate="none")
+        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter)
+        self._step = eqx.filter_jit(fixed, donate="none")
 
     def start(self, seed: int) -> tuple[STLSTM, Any]:
         """The untrained network and its optimiser's state."""
@@ -87,9 +94,9 @@ def sharding_of_batches() -> jax.sharding.NamedSharding | None:
     return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
 
 
-def _step(optimiser, perceptual, checkpoint, state, batch, key, camera, noise, light):
+def _step(optimiser, perceptual, checkpoint, jitter, state, batch, key, camera, noise, light):
     net, memory = state
-    clean, noisy = examples(batch, key, camera, noise, light)
+    clean, noisy = examples(batch, key, camera, noise, light, jitter)
 
     def value_of(net: STLSTM) -> jax.Array:
         enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
@@ -100,17 +107,19 @@ def _step(optimiser, perceptual, checkpoint, state, batch, key, camera, noise, l
     return (eqx.apply_updates(net, change), memory), value
 
 
-def examples(batch, key, camera: NoiseModel, noise: NoiseModel, light) -> tuple[jax.Array, jax.Array]:
+def examples(
+    batch, key, camera: NoiseModel, noise: NoiseModel, light, jitter: float = JITTER
+) -> tuple[jax.Array, jax.Array]:
     """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
 
-    Each example has a camera of its own, about 10 % off, and a scene between the photoelectrons of white `light`.
+    Each example has a camera of its own, off by `jitter`, and a scene between the photoelectrons of white `light`.
     """
     linear = light_of_frames(batch, len(camera.channels))
 
     def one(key, linear):
         of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
         white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
-        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise), white_e)
+        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e)
 
     noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
     return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)

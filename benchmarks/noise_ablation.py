@@ -138,11 +138,14 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
 
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
-    what = digest_of(noise, camera.model, [clip.frames for clip in clips], options.stride, options.side)[:8]
+    sizes = (options.stride, options.side, options.jitter)
+    what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
         return path
-    trainer = Trainer(Recipe(maps=options.maps, stride=options.stride), options.steps, camera, noise)
+    trainer = Trainer(
+        Recipe(maps=options.maps, stride=options.stride), options.steps, camera, noise, jitter=options.jitter
+    )
     state = trainer.start(seed)
     text = f"{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
@@ -237,6 +240,13 @@ def main(argv: list[str] | None = None) -> None:
     add("--maps", type=int, default=12, help="of the network (default: 12)")
     add("--stride", type=int, default=2, help="pixels of a block of the network: 4 see twice as far (default: 2)")
     add("--side", type=int, default=32, help="of the pieces to train on, pixels (default: 32)")
+    add(
+        "--jitter",
+        type=float,
+        default=0.0,
+        help="rms by which the logarithms of the noise's parameters vary in training (default: 0, the fit as it is:"
+        " a dark current that varies moves the black of all noises but the Gaussian, which has it in its black level)",
+    )
     add("--places", type=int, default=3, help="on the sensor, for each clip (default: 3)")
     add("--out", type=Path, default=Path("build/ablation"), help="default: build/ablation")
     options = parser.parse_args(argv)
@@ -246,6 +256,8 @@ def main(argv: list[str] | None = None) -> None:
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
     if options.seeds < 2:
         parser.error(f"--seeds: expected at least 2, as trainings scatter, too; got {options.seeds}")
+    if not 0 <= options.jitter <= 1:
+        parser.error(f"--jitter: expected 0 to 1, got {options.jitter:g}")
     for option in ("steps", "maps", "stride", "side", "places"):
         if getattr(options, option) < 1:
             parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")
