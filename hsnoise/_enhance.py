@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +42,22 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     frames = enhance(net, _noted(light, about), tile=args.tile)
     shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
     rate = frame_rate_of(args.video, args.rate)
-    count = write_video(args.out, (_pixels(frame) for frame in shown), rate)
+    with _terminable():
+        count = write_video(args.out, (_pixels(frame) for frame in shown), rate)
     print(f"{args.out}: {count} frames at {float(rate):g} a second")
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends what is within as an exception does: else a file that is half written would stay."""
+    if threading.current_thread() is not threading.main_thread():  # Python hands signals to no other
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _check(args: argparse.Namespace) -> None:

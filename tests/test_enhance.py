@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import jax
 import numpy as np
 import pytest
@@ -96,6 +99,22 @@ def test_brighten_acts_before_the_network(place, seen, more):
         means.append(np.mean(seen[0]))
     assert means[1] == pytest.approx(4 * means[0], rel=1e-5)
     assert not more or means[0] == pytest.approx(0.2, rel=1e-5)
+
+
+def test_nothing_is_left_of_a_run_that_is_terminated(place, monkeypatch):
+    def ended(net, light, tile):
+        yield next(light)
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield next(light)
+
+    monkeypatch.setattr("hsnoise._enhance.enhance", ended)
+    before, files = signal.signal(signal.SIGTERM, signal.SIG_IGN), set(place.iterdir())
+    try:
+        with pytest.raises(SystemExit, match="143"):
+            main(["enhance", str(place / "clip.npz"), str(place / "end.mp4"), "--weights", str(place / "weights3.eqx")])
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN and set(place.iterdir()) == files
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @pytest.mark.parametrize("dim", [1.0, 0.1])
