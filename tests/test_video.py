@@ -67,9 +67,9 @@ def test_colours_are_those_of_hd_video_and_say_so(tmp_path, suffix):
     path = tmp_path / f"clip{suffix}"
     write_video(path, [frame], Fraction(25))
     with av.open(str(path)) as container:
-        read = next(container.decode(video=0))
-    assert (read.colorspace, read.color_primaries, read.color_trc, read.color_range) == (1, 1, 1, 1)
-    luma = read.to_ndarray()[16, 8:96:16]
+        frame_read, tags = next(container.decode(video=0)), container.streams.video[0].codec_context
+        assert (tags.colorspace, tags.color_primaries, tags.color_trc, tags.color_range) == (1, 1, 1, 1)
+    luma = frame_read.to_ndarray()[16, 8:96:16]
     np.testing.assert_allclose(luma, 16 + 219 / 255 * colours @ [0.2126, 0.7152, 0.0722], atol=2)  # BT.709
     assert np.abs(next(frames_of(path)).astype(int) - frame).max() < 6
 
