@@ -162,20 +162,37 @@ def _sample_arguments(commands: Any) -> None:
 def _enhance_arguments(commands: Any) -> None:
     text = (
         "Enhance a noisy video with a network that `python -m benchmarks.train` trained: of display values (a video "
-        "file or a folder of images), or with --camera of raw frames."
+        "file or a folder of images), or with --camera of raw frames. Their noise should be as strong as that which "
+        "the network was trained on: an ordinary video has far less, and comes out worse. The first eight frames or "
+        "so come out poorer than those after them."
     )
     enhance = commands.add_parser("enhance", help="take the noise out of a video", description=text)
     enhance.add_argument("video", metavar="IN", help="a video file, a folder of images, or raw frames with --camera")
     enhance.add_argument("out", type=Path, metavar="OUT", help="video file to write: .mp4, .mkv, ...")
     enhance.add_argument("--weights", type=Path, required=True, metavar="FILE", help="weights.eqx of a training run")
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
-    enhance.add_argument("--exposure", type=_numbers, metavar="S", help="of raw frames, where their files do not say")
     enhance.add_argument(
-        "--cfa", type=_cfa, metavar="CFA", help="Bayer order of raw frames, where it is not the model's"
+        "--exposure", type=_numbers, metavar="S", help="of raw frames, in seconds (default: what their files say)"
     )
-    enhance.add_argument("--brighten", type=float, default=1.0, metavar="X", help="times more light (default 1)")
     enhance.add_argument(
-        "--tile", type=_positive, metavar="PIXELS", help="work in tiles of so many, in less memory: 256, say"
+        "--cfa",
+        type=_cfa,
+        metavar="CFA",
+        help="Bayer order of raw frames (default: what their files say, or else the model's)",
+    )
+    enhance.add_argument(
+        "--brighten",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="times more light (default 1), before the network sees the frames; with --camera the mean of the first "
+        "frame becomes X times 0.2 of white",
+    )
+    enhance.add_argument(
+        "--tile",
+        type=_positive,
+        metavar="PIXELS",
+        help="work in tiles of so many (a multiple of the network's stride), in less memory: 256, say",
     )
     enhance.add_argument("--rate", type=float, default=25, help="frames a second of what says none (default 25)")
 

@@ -298,11 +298,11 @@ def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords
     print(f"Reported in {args.report}")
 
 
-def _model(name: str) -> NoiseModel:
+def _model(name: str, argument: str = "model") -> NoiseModel:
     if name in CAMERAS:
         return CAMERAS[name]()
     if not Path(name).is_file():
-        raise ValueError(f"model: expected a model.json or one of {', '.join(CAMERAS)}, but there is no file {name}")
+        raise ValueError(f"{argument}: expected a model.json or one of {', '.join(CAMERAS)}, and there is no {name}")
     return NoiseModel.load(name)
 
 
@@ -395,5 +395,5 @@ RUN = {
     "diagnose": _diagnose,
     "improve": _improve,
     "sample": _sample,
-    "enhance": lambda args: _enhance.run(args, None if args.camera is None else _model(args.camera)),
+    "enhance": lambda args: _enhance.run(args, args.camera and _model(args.camera, "--camera")),
 }

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._arguments import listed, whole_number
 from hsnoise._types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
@@ -64,7 +65,9 @@ class Convolution(eqx.Module):
     bias: jax.Array
 
     def __init__(self, key: RandomKey, kernel: int, inputs: int, outputs: int):
-        """Weights are normal with variance 1 / (kernel^2 inputs); biases are 0."""
+        """Weights are normal with variance 1 / (kernel^2 inputs); biases are 0. Raises ValueError for even kernels."""
+        if kernel % 2 == 0:
+            raise ValueError(f"kernel: expected an odd size, got {kernel}")
         scale = 1 / np.sqrt(kernel**2 * inputs)
         self.weight = jnp.float32(scale) * jax.random.normal(key, (kernel, kernel, inputs, outputs), jnp.float32)
         self.bias = jnp.zeros(outputs, jnp.float32)
@@ -147,18 +150,18 @@ class STLSTM(eqx.Module):
         """Make an untrained network.
 
         Raises:
-            ValueError: for sizes below 1 or even kernels.
+            ValueError: for sizes below 1 or even kernels, TypeError for what is no whole number.
         """
         for name, value in {"maps": maps, "stride": stride, "channels": channels}.items():
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
-        if not kernels or any(kernel < 1 or kernel % 2 == 0 for kernel in kernels):
-            raise ValueError(f"kernels: expected odd sizes, one a layer, got {tuple(kernels)}")
+            whole_number(name, value, 1)
+        kernels = listed("kernels", kernels, "odd sizes, one a layer")
+        if not kernels or any(whole_number("kernels", kernel, 1) % 2 == 0 for kernel in kernels):
+            raise ValueError(f"kernels: expected odd sizes, one a layer, got {kernels}")
         first, last, *rest = jax.random.split(key, 2 + len(kernels))
         self.features = Convolution(first, 3, channels * stride**2, maps)
         self.cells = tuple(Cell(key, kernel, maps) for key, kernel in zip(rest, kernels, strict=True))
         self.output = Convolution(last, 3, maps, channels * stride**2)
-        self.maps, self.kernels, self.stride, self.channels = maps, tuple(kernels), stride, channels
+        self.maps, self.kernels, self.stride, self.channels = maps, kernels, stride, channels
 
     def init_state(self, shape: tuple[int, int], batch: int = 1) -> State:
         """The state before the first frame of `shape` (rows, columns)."""
@@ -176,8 +179,9 @@ class STLSTM(eqx.Module):
         Raises:
             ValueError: for a frame of other channels, or of another size or batch than the state.
         """
+        frame = jnp.asarray(frame, self.features.weight.dtype)
         single = frame.ndim == 3
-        frames = jnp.asarray(frame[None] if single else frame, self.features.weight.dtype)
+        frames = frame[None] if single else frame
         self._check(frames, state)
         rows, columns = frames.shape[1:3]
         missing = [(-n) % self.stride for n in (rows, columns)]
@@ -192,7 +196,7 @@ class STLSTM(eqx.Module):
         return (out[0] if single else out), State(tuple(hidden), tuple(cell), memory)
 
     def _check(self, frames: jax.Array, state: State) -> None:
-        if frames.ndim != 4 or frames.shape[-1] != self.channels:
+        if frames.ndim != 4 or frames.shape[-1] != self.channels or not frames.size:
             raise ValueError(f"frame: expected [row, column, {self.channels}] or a batch of it, got {frames.shape}")
         expected = (len(frames), *(-(-n // self.stride) for n in frames.shape[1:3]))
         if state.memory.shape[:3] != expected:
@@ -252,7 +256,7 @@ def enhance(
     step = eqx.filter_jit(lambda net, frame, state: net(frame, state))
     states: dict[tuple[int, ...], State] = {}
     shape = None
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(map(np.asarray, frames)):
         if shape is not None and frame.shape != shape:
             raise ValueError(f"frames: frame {number} has shape {frame.shape}, those before {shape}")
         shape = frame.shape

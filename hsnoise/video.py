@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import uuid
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -18,21 +20,32 @@ from hsnoise._frames import in_order
 VIDEO = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 WRITTEN = tuple(suffix for suffix in VIDEO if suffix != ".webm")  # those that hold H.264
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-QUALITY = {"crf": "16"}  # of x264: hard to tell from the original
+# Of x264. crf: hard to tell from the original. mbtree: with it the same frames give another file each time.
+OPTIONS = {"crf": "16", "mbtree": "0"}
+BT709 = 1  # matrix, primaries and curve of HD video, in ITU-T H.273
+BITS_PER_SAMPLE = 258  # tag of TIFF
+LIMITED = 1  # range of 16 to 235, as FFmpeg numbers it
+WHOLE, SLACK_S = 0.95, 0.2  # of the length that a file announces: less is a loss, not a longer sound track
 
 
 def is_clip(path: Path) -> bool:
-    """Whether `frames_of` might read this path."""
+    """Whether `frames_of` might read this path. Hidden files are no clips: macOS puts some beside every other."""
     if path.is_dir():
-        return any(child.suffix.lower() in IMAGES for child in path.iterdir())
-    return path.suffix.lower() in (*VIDEO, ".npz", ".npy")
+        return any(map(_is_image, path.iterdir()))
+    return not path.name.startswith(".") and path.suffix.lower() in (*VIDEO, ".npz", ".npy")
+
+
+def _is_image(path: Path) -> bool:
+    return not path.name.startswith(".") and path.suffix.lower() in IMAGES
 
 
 def frames_of(path: str | os.PathLike) -> Iterator[np.ndarray]:
-    """Frames [row, column, 3] of uint8, display values in R, G, B, one after the other.
+    """Frames [row, column, 3] of uint8, display values in R, G, B, upright, one after the other.
 
-    path: a video file, a folder of images (in the order of their names, numbers by their size), or an .npz (array
-        `frames`) or .npy file.
+    Warns after the last frame of a video file that is cut off or damaged.
+
+    path: a video file, a folder of images (in the order of their names, numbers by their size; every page of a TIFF
+        is a frame), or an .npz (array `frames`) or .npy file.
 
     Raises:
         ValueError: an unknown format, no frames, frames of several sizes, images of more than 8 bits or with an
@@ -74,29 +87,27 @@ def frame_rate_of(path: str | os.PathLike, default: float = 25) -> Fraction:
 
 
 def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fraction) -> int:
-    """Write frames [row, column, 3] of uint8 as H.264, all or nothing; returns how many.
+    """Write frames [row, column, 3] of uint8 as H.264 in the colours of HD video, all or nothing; returns how many.
 
-    Odd sizes lose their last row or column: the format has none. Raises ValueError for no frames or an unknown
-    suffix, ImportError without PyAV.
+    Odd sizes lose their last row or column, with a warning: the format has none. Raises ValueError for no frames or
+    an unknown suffix, ImportError without PyAV.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITTEN:
         raise ValueError(f"{path}: expected a video file, ending in {', '.join(WRITTEN)}")
     av = _av(path)
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp{path.suffix}")
     count = 0
     try:
         with av.open(str(temporary), "w") as container:
-            stream = container.add_stream("libx264", rate=rate, options=QUALITY)
-            stream.pix_fmt = "yuv420p"
+            stream = _stream(container, rate)
             for frame in frames:
-                rows, columns = (n - n % 2 for n in frame.shape[:2])
-                if min(rows, columns) < 2:
-                    raise ValueError(f"frames: expected at least 2 x 2 pixels, got {frame.shape[0]} x {frame.shape[1]}")
                 if not count:
-                    stream.width, stream.height = columns, rows
+                    stream.height, stream.width = _even(frame.shape[:2])
                 count += 1
-                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame[:rows, :columns]), format="rgb24")
+                pixels = np.ascontiguousarray(frame[: stream.height, : stream.width])
+                picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                picture = picture.reformat(format=stream.pix_fmt, dst_colorspace=BT709, dst_color_range=LIMITED)
                 container.mux(stream.encode(picture))
             if not count:
                 raise ValueError("frames: expected at least one, got none")
@@ -105,6 +116,27 @@ def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fra
     finally:
         temporary.unlink(missing_ok=True)
     return count
+
+
+def _stream(container: Any, rate: Fraction) -> Any:
+    stream = container.add_stream("libx264", rate=rate, options=OPTIONS)
+    stream.pix_fmt = "yuv420p"
+    context = stream.codec_context
+    context.colorspace = context.color_primaries = context.color_trc = BT709
+    context.color_range = LIMITED
+    return stream
+
+
+def _even(shape: tuple[int, int]) -> tuple[int, int]:
+    rows, columns = (n - n % 2 for n in shape)
+    if min(rows, columns) < 2:
+        raise ValueError(f"frames: expected at least 2 x 2 pixels, got {shape[0]} x {shape[1]}")
+    if (rows, columns) != shape:
+        warnings.warn(
+            f"frames: H.264 has even sizes only, so {rows} x {columns} of {shape[0]} x {shape[1]} pixels are written",
+            stacklevel=3,
+        )
+    return rows, columns
 
 
 def _av(path: Path) -> ModuleType:
@@ -131,25 +163,65 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
     with _opened(path) as container:
         if not container.streams.video:
             raise ValueError(f"{path}: holds no video")
-        for frame in container.decode(video=0):
-            yield frame.to_ndarray(format="rgb24")
+        count, end_s, damaged = 0, 0.0, False
+        for packet in container.demux(video=0):
+            damaged |= packet.is_corrupt
+            start = packet.dts if packet.pts is None else packet.pts
+            if start is not None:
+                end_s = max(end_s, float((start + (packet.duration or 0)) * packet.time_base))
+            for frame in packet.decode():
+                damaged |= frame.is_corrupt
+                count += 1
+                yield np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+        announced_s = _length_s(container)
+        if damaged or end_s < WHOLE * announced_s - SLACK_S:  # else FFmpeg passes over what it cannot read
+            warnings.warn(
+                f"{path}: cut off or damaged; {count} frames could be read, up to {end_s:.3g} s, of a video of"
+                f" {announced_s:.3g} s",
+                stacklevel=2,
+            )
+
+
+def _length_s(container: Any) -> float:
+    """Length of the video, s, that the file announces; 0 if it does not."""
+    stream = container.streams.video[0]
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    if "DURATION" in stream.metadata:  # of Matroska
+        hours, minutes, seconds = map(float, stream.metadata["DURATION"].split(":"))
+        return 3600 * hours + 60 * minutes + seconds
+    return (container.duration or 0) / 1e6  # microseconds, of the longest stream
 
 
 def _images(folder: Path) -> Iterator[np.ndarray]:
     from PIL import Image, UnidentifiedImageError
 
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES and not path.name.startswith(".")]
-    for path in sorted(paths, key=in_order):
+    for path in sorted(filter(_is_image, folder.iterdir()), key=in_order):
         try:
             with Image.open(path) as image:
-                if image.mode.startswith(("I", "F")):
-                    raise ValueError(f"{path}: expected 8 bits a channel, display values; got mode {image.mode}")
-                if "A" in image.getbands() or "transparency" in image.info:
-                    raise ValueError(f"{path}: expected an image without an alpha channel")
-                pixels = np.asarray(image.convert("RGB"))
+                yield from _pages(path, image)
         except (UnidentifiedImageError, OSError) as error:
             raise ValueError(f"{path}: cannot be read as an image ({error})") from error
-        yield pixels
+
+
+def _pages(path: Path, image: Any) -> Iterator[np.ndarray]:
+    from PIL import ImageOps, ImageSequence
+
+    for page in ImageSequence.Iterator(image):
+        if _is_deep(page):
+            raise ValueError(f"{path}: expected 8 bits a channel, display values; got more")
+        if "A" in page.getbands() or "transparency" in page.info:
+            raise ValueError(f"{path}: expected an image without an alpha channel")
+        yield np.asarray(ImageOps.exif_transpose(page).convert("RGB"))
+        if image.format == "MPO":  # of phones: the other pictures in it are maps of depth or of gain
+            return
+
+
+def _is_deep(page: Any) -> bool:
+    """Whether the file holds more than 8 bits a channel, of which Pillow makes 8 if there are three channels."""
+    in_tiff = getattr(page, "tag_v2", {}).get(BITS_PER_SAMPLE, (8,))
+    in_png = any(str(tile.args).endswith(";16B") for tile in page.tile)
+    return in_png or max(in_tiff) > 8 or page.mode.startswith(("I", "F"))
 
 
 def _array(path: Path) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Networks and checkpoints on disk: one line of JSON that says what follows, then the arrays.
 
-Files are written whole or not at all, and a hash tells one that was cut off or changed.
+Files are written whole or not at all, and a hash tells one that was cut off or changed. Of the first format it covers
+the arrays alone, of the second what `about` says of them too.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from hsnoise._output import write_atomically
 from hsnoise.stlstm import STLSTM
 
-FORMAT = "hsnoise arrays 1"
+FIRST_FORMAT, FORMAT = "hsnoise arrays 1", "hsnoise arrays 2"
 
 
 def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:
@@ -31,8 +33,16 @@ def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -
     buffer = io.BytesIO()
     eqx.tree_serialise_leaves(buffer, tree)
     content = buffer.getvalue()
-    header = {"format": FORMAT, "sha256": hashlib.sha256(content).hexdigest(), "about": dict(about)}
-    write_atomically(path, json.dumps(header).encode() + b"\n" + content)
+    header = {"format": FORMAT, "sha256": _digest(_json(about) + content), "about": dict(about)}
+    write_atomically(path, _json(header) + b"\n" + content)
+
+
+def _json(mapping: Mapping[str, Any]) -> bytes:
+    return json.dumps(dict(mapping)).encode()
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def read_arrays(path: str | os.PathLike, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -56,14 +66,16 @@ def _read(path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
     first, newline, content = Path(path).read_bytes().partition(b"\n")
     try:
         header = json.loads(first)
-        known = newline == b"\n" and header["format"] == FORMAT
-    except (ValueError, KeyError, TypeError):
-        known = False
-    if not known:
-        raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise")
-    if hashlib.sha256(content).hexdigest() != header["sha256"]:
+        about, covered = (
+            header["about"],
+            {FIRST_FORMAT: b"", FORMAT: _json(header["about"])}[header["format"]] + content,
+        )
+        whole = newline == b"\n" and _digest(covered) == header["sha256"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise") from None
+    if not whole:
         raise ValueError(f"{path}: cut off or changed since it was written")
-    return header["about"], content
+    return about, content
 
 
 def _first_line(error: Exception) -> str:
@@ -79,13 +91,19 @@ def load_network(path: str | os.PathLike) -> tuple[STLSTM, dict[str, Any]]:
     """The network in a file of `save_network`, and what it was trained for.
 
     Raises:
-        ValueError: for a file that holds no network, or was cut off or changed.
+        ValueError: for a file that holds no network, or one that is not finite, or was cut off or changed.
     """
     about, content = _read(path)
     if "network" not in about:
-        raise ValueError(f"{path}: holds no network")
-    like = eqx.filter_eval_shape(STLSTM, jax.random.key(0), **about["network"])
-    return _restored(path, content, like), about
+        raise ValueError(f"{path}: holds no network; of a training run give weights.eqx, not a checkpoint")
+    try:
+        like = eqx.filter_eval_shape(STLSTM, jax.random.key(0), **about["network"])
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: its header describes no network ({_first_line(error)})") from error
+    net = _restored(path, content, like)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(net)):
+        raise ValueError(f"{path}: expected finite weights, got NaN or infinity")
+    return net, about
 
 
 def sizes_of(net: STLSTM) -> dict[str, Any]:

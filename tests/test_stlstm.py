@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsnoise.stlstm import LAYOUT, STLSTM, convolve, enhance, from_blocks, loss, to_blocks, total_variation
+from hsnoise.stlstm import LAYOUT, STLSTM, Convolution, convolve, enhance, from_blocks, loss, to_blocks, total_variation
 
 KEY = jax.random.key(2)
 NET = STLSTM(KEY, maps=4, kernels=(3, 5), stride=2)
@@ -88,6 +88,11 @@ def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
 
+def test_tiles_that_the_stride_does_not_divide_are_refused():
+    with pytest.raises(ValueError, match="tile, margin: expected multiples of the stride 2, got 7"):
+        next(enhance(NET, [np.zeros((8, 8, 3))], tile=7))
+
+
 def test_a_few_steps_learn():
     clean = jnp.full((4, 2, 16, 16, 3), 0.5)
     noisy = clean + 0.2 * jax.random.normal(KEY, clean.shape)
@@ -133,7 +138,25 @@ def test_odd_sizes_keep_their_shape():
     assert NET(out, state)[0].shape == frame.shape
 
 
-@pytest.mark.parametrize("shape", [(8, 8, 4), (8, 8), (1, 8, 8, 1)])
+@pytest.mark.parametrize("arguments", [{"maps": 2.5}, {"stride": "2"}, {"kernels": 3}, {"kernels": (3.0,)}])
+def test_sizes_that_are_no_whole_numbers_are_named(arguments):
+    with pytest.raises(TypeError, match=f"{next(iter(arguments))}: expected"):
+        STLSTM(KEY, **arguments)
+
+
+def test_even_kernels_are_refused():
+    with pytest.raises(ValueError, match="kernel: expected an odd size, got 4"):
+        Convolution(KEY, 4, 3, 3)
+
+
+def test_frames_may_be_lists():
+    frame = np.ones((8, 8, 3), np.float32)
+    state = NET.init_state((8, 8))
+    np.testing.assert_array_equal(NET(frame.tolist(), state)[0], NET(frame, state)[0])
+    np.testing.assert_array_equal(next(enhance(NET, [frame.tolist()])), next(enhance(NET, [frame])))
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 4), (8, 8), (1, 8, 8, 1), (0, 8, 3), (0, 8, 8, 3)])
 def test_bad_frames_are_named(shape):
     with pytest.raises(ValueError, match="frame: expected"):
         NET(jnp.zeros(shape), NET.init_state((8, 8)))

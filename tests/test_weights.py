@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from pathlib import Path
+
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -22,7 +27,20 @@ def test_a_network_comes_back_exactly(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda c: c[:-7], lambda c: c[:30], lambda c: c[:-1] + b"x", lambda c: b"", lambda c: b"\x00" * 90]
+    "damage",
+    [
+        lambda c: c[:-7],
+        lambda c: c[:30],
+        lambda c: c[:-1] + b"x",
+        lambda c: b"",
+        lambda c: b"\x00" * 90,
+        lambda c: c.replace(b'"maps": 2', b'"maps": 3'),
+        lambda c: c.replace(b'"channels": 1', b'"channels": 4').replace(b'"stride": 2', b'"stride": 1'),
+        lambda c: b'{"format": "hsnoise arrays 1"}\n',
+        lambda c: b'{"format": "hsnoise arrays 2"}\n',
+        lambda c: b'{"format": "hsnoise arrays 1", "about": {}}\n',
+        lambda c: b"[" * 100_000 + b"\n",
+    ],
 )
 def test_a_damaged_file_is_told(tmp_path, damage):
     path = tmp_path / "net.eqx"
@@ -37,7 +55,7 @@ def test_arrays_of_another_network_are_told(tmp_path):
     write_arrays(path, NET, {})
     with pytest.raises(ValueError, match="another network"):
         read_arrays(path, STLSTM(jax.random.key(0), maps=4, kernels=(3, 5), channels=1))
-    with pytest.raises(ValueError, match="holds no network"):
+    with pytest.raises(ValueError, match="holds no network; .* give weights.eqx"):
         load_network(path)
 
 
@@ -53,3 +71,45 @@ def test_a_failed_write_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         save_network(path, NET, {"more": 1})
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"maps": "4"},
+        {"maps": 2.5},
+        {"stride": 0},
+        {"foo": 1},
+        {"kernels": 3},
+        {"kernels": [2]},
+        {"maps": 10**30},
+        [],
+        3,
+    ],
+)
+def test_headers_that_describe_no_network_are_told(tmp_path, network):
+    path = tmp_path / "net.eqx"
+    write_arrays(path, NET, {"network": network})
+    with pytest.raises(ValueError, match=f"{path}: its header describes no network"):
+        load_network(path)
+
+
+def test_weights_that_are_not_finite_are_told(tmp_path):
+    path = tmp_path / "net.eqx"
+    save_network(path, eqx.tree_at(lambda net: net.output.bias, NET, replace_fn=lambda bias: bias * np.nan), {})
+    with pytest.raises(ValueError, match="expected finite weights"):
+        load_network(path)
+
+
+def test_weights_of_the_first_format_are_read(tmp_path):
+    net, about = load_network(Path(__file__).parents[1] / "benchmarks" / "weights" / "canon_5d3.eqx")
+    assert net.channels == 3 and about["camera"] == "canon_5d3"
+    path = tmp_path / "net.eqx"
+    save_network(path, NET, {"camera": "any"})
+    first, _, content = path.read_bytes().partition(b"\n")
+    header = {**json.loads(first), "format": "hsnoise arrays 1", "sha256": hashlib.sha256(content).hexdigest()}
+    path.write_bytes(json.dumps(header).encode() + b"\n" + content)
+    assert load_network(path)[1]["camera"] == "any"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(ValueError, match="cut off or changed"):
+        load_network(path)
