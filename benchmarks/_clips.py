@@ -42,8 +42,7 @@ def read_clips(folder: Path | None) -> list[Clip]:
         return moving_stills()
     if not folder.is_dir():
         raise ValueError(f"--clips: expected a folder, got {folder}")
-    # Hidden files are other programs' own, such as the ._name beside each file of some discs.
-    paths = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and is_clip(path)]
+    paths = [path for path in sorted(folder.iterdir()) if is_clip(path)]
     if not paths and is_clip(folder):
         paths = [folder]
     if not paths:

@@ -1,7 +1,6 @@
 """Networks and checkpoints on disk: one line of JSON that says what follows, then the arrays.
 
-Files are written whole or not at all, and a hash tells one that was cut off or changed. Of the first format it covers
-the arrays alone, of the second what `about` says of them too.
+Files are written whole or not at all, and a hash tells one that was cut off or changed.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 from hsnoise._output import write_atomically
 from hsnoise.stlstm import STLSTM
 
-FIRST_FORMAT, FORMAT = "hsnoise arrays 1", "hsnoise arrays 2"
+FORMAT = "hsnoise arrays 2"
 
 
 def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:
@@ -66,13 +65,12 @@ def _read(path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
     first, newline, content = Path(path).read_bytes().partition(b"\n")
     try:
         header = json.loads(first)
-        about, covered = (
-            header["about"],
-            {FIRST_FORMAT: b"", FORMAT: _json(header["about"])}[header["format"]] + content,
-        )
-        whole = newline == b"\n" and _digest(covered) == header["sha256"]
+        known, about = header["format"] == FORMAT, header["about"]
+        whole = newline == b"\n" and _digest(_json(about) + content) == header["sha256"]
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise") from None
+        known = whole = False
+    if not known:
+        raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise")
     if not whole:
         raise ValueError(f"{path}: cut off or changed since it was written")
     return about, content

@@ -188,7 +188,13 @@ def test_bad_clips_are_told(tmp_path):
     (tmp_path / "empty").mkdir()
     np.savez(tmp_path / "grey.npz", frames=FRAMES[..., 0])
     np.savez(tmp_path / "other.npz", video=FRAMES)
-    (tmp_path / "cut.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:50])
+    whole = (tmp_path / "other.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[:50])
+    np.savez_compressed(tmp_path / "corrupt.npz", frames=FRAMES)
+    packed = bytearray((tmp_path / "corrupt.npz").read_bytes())
+    packed[len(packed) // 2 : len(packed) // 2 + 40] = bytes(40)
+    (tmp_path / "corrupt.npz").write_bytes(packed)
+    (tmp_path / "archive.npy").write_bytes(whole)
     (tmp_path / "text.txt").write_text("no")
     mixed = tmp_path / "mixed"
     mixed.mkdir()
@@ -202,6 +208,8 @@ def test_bad_clips_are_told(tmp_path):
         "grey.npz": "expected frames",
         "other.npz": "array `frames`",
         "cut.npz": "array `frames`",
+        "corrupt.npz": "array `frames`",
+        "archive.npy": "array `frames`",
         "text.txt": "unknown format",
         "mixed": "frame 1 has shape",
         "broken": "cannot be read as an image",
