@@ -5,7 +5,8 @@
 The same network and steps are trained with (a) independent Gaussian noise of the sensor's variance, (b) shot and read
 noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that after
 `hsnoise.improve`. They are tested on held-out clips whose light, with shot noise, is added to dark frames of the sensor
-that no fit has seen. Everything that is finished is kept in `--out`; the same command goes on.
+that no fit has seen. From real frames and from drawn ones the level of their darks is taken off. Everything that is
+finished is kept in `--out`; the same command goes on.
 
 The sensors are those of a folder outside the project (HSNOISE_SHARED, or ../shared).
 """
@@ -16,11 +17,12 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
@@ -43,7 +45,8 @@ from hsnoise.weights import load_network, save_network
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
 DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame
 BATCH, FRAMES, CROP = 4, 8, 128
-OUTSIDE = 6.0  # standard deviations
+OUTSIDE, NEAR = 6.0, 3.0  # standard deviations
+MATCH_SIDE = 256
 
 
 @dataclass(frozen=True)
@@ -56,16 +59,20 @@ class Sensor:
     exposure_s: float
 
     @cached_property
-    def dark_sigma_dn(self) -> float:
-        """Temporal standard deviation of the fitted darks nearest in exposure, DN, before they were rounded to counts.
-
-        From differences of frames.
-        """
+    def fitted_darks(self) -> np.ndarray:
+        """The fitted darks nearest in exposure, DN [frame, row, column]."""
         stack = self.fitted
         darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
         chosen = min(darks, key=lambda i: abs(stack.exposure_s[i] - self.exposure_s))
-        frames = np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
-        apart = np.diff(frames, axis=0)
+        return np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
+
+    @cached_property
+    def dark_sigma_dn(self) -> float:
+        """Temporal standard deviation of these darks, DN, before they were rounded to counts.
+
+        From differences of frames.
+        """
+        apart = np.diff(self.fitted_darks, axis=0)
         # Cosmic rays are rare and huge: differences that are far outside the others count as just outside.
         low, high = np.quantile(apart, [0.1587, 0.8413])
         far = OUTSIDE * (high - low) / 2
@@ -136,8 +143,30 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
     return {name: NoiseModel.load(path) for name, path in paths.items()}
 
 
+def level_of(darks: np.ndarray) -> float:
+    """Mean of dark frames, DN, without outliers such as hot pixels."""
+    low, middle, high = np.quantile(darks, [0.1587, 0.5, 0.8413])
+    near = np.abs(darks - middle) <= NEAR * max((high - low) / 2, 1.0)
+    return float(darks[near].mean())
+
+
+def levelled(camera: Camera, level_dn: float) -> Camera:
+    """The camera whose frames without light lie at `level_dn`: what a user takes off is what dark frames show.
+
+    A noise model is judged by its noise then, not by the level that its fit happens to have at one exposure.
+    """
+    model = camera.model
+    dark_dn = np.asarray(model["gain"].value) * float(model["dark_current"].rate) * model.exposure_s
+    return replace(camera, model=model.with_value("black_level", "value", level_dn - dark_dn))
+
+
+def drawn_darks(noise: NoiseModel) -> np.ndarray:
+    return np.asarray(hsnoise.sample_dark(jax.random.key(0), FRAMES, (MATCH_SIDE, MATCH_SIDE), noise), np.float64)
+
+
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
+    camera = levelled(camera, level_of(drawn_darks(noise)))
     sizes = (options.stride, options.side, options.jitter)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
@@ -159,7 +188,8 @@ def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, opti
 
 def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
     sigma = sensor.dark_sigma_e(paper)
-    return Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma))
+    camera = Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma))
+    return levelled(camera, level_of(sensor.fitted_darks))
 
 
 def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:

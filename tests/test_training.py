@@ -15,7 +15,8 @@ from benchmarks._clips import Clip, crops, held_out, read_clips
 from benchmarks._noisy import Camera, camera_of
 from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._training import Recipe, Trainer, batch_rng
-from hsnoise.effects import ADC, BlackLevel, Gain, ReadNoise, ShotNoise
+from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
+from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import display_from_linear
 from hsnoise.weights import load_network, save_network
 
@@ -314,6 +315,18 @@ def test_light_is_added_to_real_dark_frames():
     assert noisy.mean() == pytest.approx(0.503, abs=0.02)
     electrons = 20 * 0.503
     assert noisy.std() * 20 == pytest.approx(np.sqrt(electrons + 4 + (1 / 12 / 0.25) * 2), rel=0.05)
+
+
+def test_the_level_of_darks_is_taken_off_whatever_the_fit_says(rng):
+    # A fit whose level is off by 30 DN, in frames with hot pixels.
+    effects = [ShotNoise(), DarkCurrent(40.0), ReadNoise(3.0), Gain(2.0), BlackLevel(100.0), ADC(4095)]
+    model = hsnoise.NoiseModel(effects, cfa="mono", shutter="global", exposure_s=0.5)
+    darks = np.asarray(hsnoise.sample_dark(jax.random.key(0), 4, (64, 64), model), float)
+    hot = np.where(rng.random(darks.shape) < 0.01, 4000.0, darks)
+    assert noise_ablation.level_of(hot) == pytest.approx(140, abs=0.6)
+    camera = Camera("sensor", model.with_value("black_level", "value", 130.0), (20.0, 20.0))
+    camera = noise_ablation.levelled(camera, noise_ablation.level_of(hot))
+    assert float(electrons_of(darks, camera.model).mean()) == pytest.approx(0, abs=0.3)
 
 
 @pytest.mark.parametrize("sigma_dn", [0.7, 1.5, 20.0])
