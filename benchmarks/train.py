@@ -135,7 +135,7 @@ def loop(trainer, state, first, preset, clips, validation, about, options, conso
                     _checkpoints.write(options.out, done, state, about)
                     saved, saved_at = time.monotonic(), done
     except KeyboardInterrupt:
-        if at[0] > saved_at:
+        if at[0] > saved_at and math.isfinite(at[2]):
             _checkpoints.write(options.out, at[0], at[1], about)
         raise
     return at[1]
