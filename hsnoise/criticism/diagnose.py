@@ -121,7 +121,9 @@ def diagnose(
     if found.verdict != "unexplained":
         return found
     prints = [one.of for one in judged]
-    return replace(found, nearest=nearest(prints, found.ranking, z, slopes, np.diagonal(bench.base.law.covariance)))
+    return replace(
+        found, nearest=nearest(prints, found.ranking, evidence, slopes, np.diagonal(bench.base.law.covariance))
+    )
 
 
 def _limit(judged: list[Judged], draws: int, bench: Bench, evidence: Evidence) -> float:

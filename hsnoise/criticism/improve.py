@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -188,19 +188,10 @@ def improve(
             return Story(tuple(steps), _would_be_next(nearest[0], last.comparison), split)
         if not nearest:
             return Story(tuple(steps), _end(found, last.comparison), split)
-        for candidate in nearest:
-            step = work.with_one_more(steps, candidate)
-            if (
-                step is not None
-                and _is_better(step, last)
-                and _is_there(candidate.effect, step.fit)
-                and work.needs(candidate.name, step)
-            ):
-                steps.append(step)
-                break
-        else:
-            ended = _left_out([candidate.name for candidate in nearest], found, last.comparison)
-            return Story(tuple(steps), ended, split)
+        step, refused = work.first_that_holds(nearest, steps)
+        if step is None:
+            return Story(tuple(steps), _left_out(refused, found, last.comparison), split)
+        steps.append(step)
 
 
 @dataclass(frozen=True)
@@ -217,6 +208,29 @@ class _Work:
         comparison = compare(result.params, self.fitted, seed=self.seed)
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
+
+    def first_that_holds(
+        self, candidates: Sequence[Candidate], steps: list[Step]
+    ) -> tuple[Step | None, dict[str, str]]:
+        """The first candidate with which the model is better, as a step, and why those before it were left out."""
+        refused: dict[str, str] = {}
+        for candidate in candidates:
+            step = self.with_one_more(steps, candidate)
+            reason = "could not be fitted" if step is None else self.refusal(candidate.effect, step, steps[-1])
+            if not reason:
+                return step, refused
+            refused[candidate.name] = reason
+            self.say(f"{candidate.name} is left out, {reason}")
+        return None, refused
+
+    def refusal(self, effect: AbstractEffect, step: Step, before: Step) -> str:
+        """Why the step with the effect is not kept, in words; empty if it is."""
+        worse = _why_worse(step, before)
+        if worse:
+            return worse
+        if not _is_there(effect, step.fit):
+            return "came out compatible with zero"
+        return "" if self.needs(effect.name, step) else "changed nothing by itself"
 
     def needs(self, name: str, step: Step) -> bool:
         """Whether some group fits worse without the effect: if not, what helped was that the others were refitted."""
@@ -268,16 +282,21 @@ def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...
         check_effects(base.add(effect), stack)
 
 
-def _is_better(step: Step, before: Step) -> bool:
-    """Whether statistics, and frames that no fit has seen, fit better or as well with what was added."""
+def _why_worse(step: Step, before: Step) -> str:
+    """In which way statistics, or frames that no fit has seen, fit worse with what was added; empty if they do not."""
     # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
-    seen = np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params)
+    unseen = not (np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params))
     gained, after, until_now = step.held_out - before.held_out, step.comparison, before.comparison
-    if after.error <= until_now.error:
-        return seen or gained > WORSE
-    # The worst group may be that of another effect, which is still missing and does not stand quite still.
-    less = sum(after.groups.values()) < sum(until_now.groups.values())
-    return less and after.error <= CHANGE_OF_OTHERS * until_now.error and (seen or gained > 0)
+    if not step.fit.converged and after.error * CHANGE_OF_OTHERS > until_now.error > CHANCE_ERROR:
+        return f"no fit with it converged, and the error hardly fell ({until_now.error:.3g} -> {after.error:.3g})"
+    allowed = WORSE
+    if after.error > until_now.error:
+        # The worst group may be that of another effect, which is still missing and does not stand quite still.
+        less = sum(after.groups.values()) < sum(until_now.groups.values())
+        if not less or after.error > CHANGE_OF_OTHERS * until_now.error:
+            return f"statistics fit worse with it (error {until_now.error:.3g} -> {after.error:.3g})"
+        allowed = 0.0
+    return f"held-out frames fit worse with it, by {-gained:.1f} nats" if unseen and gained <= allowed else ""
 
 
 def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
@@ -297,15 +316,12 @@ def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
     return not rows or any(abs(value) > THERE_SIGMA * error for value, error, _ in rows)
 
 
-def _left_out(tried: list[str], found: Diagnosis, comparison: Comparison) -> str:
-    names = " or ".join(tried)
-    reason = (
-        f"Adding {names} was tried, but it came out compatible with zero, changed nothing by itself, or held-out frames"
-        " or statistics fit worse with it: it was left out."
-    )
+def _left_out(refused: dict[str, str], found: Diagnosis, comparison: Comparison) -> str:
+    tried = "; ".join(f"{name} {reason}" for name, reason in refused.items())
+    said = f"What was tried is left out: {tried}."
     if comparison.error <= CHANCE_ERROR:
-        return f"{reason} Without it the error is {comparison.error:.2f}, as chance gives."
-    return f"{reason} {_end(found, comparison)}"
+        return f"{said} Without it the error is {comparison.error:.2f}, as chance gives."
+    return f"{said} {_end(found, comparison)}"
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:

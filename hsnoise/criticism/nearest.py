@@ -7,28 +7,33 @@ statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
-from hsnoise.criticism.ranking import GRID, Candidate
+from hsnoise.criticism.ranking import GRID, Candidate, Evidence
+from hsnoise.criticism.reference import misfits
 
 FREEDOM = 4.0
 ITERATIONS = 10
 LEAST_GAIN = 8.0  # nats
+LEAST_SHARE = 0.5  # of the misfit of the worst group, at least, that an effect takes away to be tried for it
 
 
 def nearest(
-    prints: Iterable[Fingerprint], ranking: Iterable[Candidate], z: np.ndarray, slopes: np.ndarray, variance: np.ndarray
+    prints: Sequence[Fingerprint], ranking: Iterable[Candidate], evidence: Evidence, slopes: np.ndarray, variance
 ) -> tuple[Candidate, ...]:
     """Candidates of the ranking by what they gain, the best first, with parameters of that gain.
 
-    z [statistic]: the capture's; slopes [parameter, statistic]: shifts by wrong base parameters, which are free;
-    variance [statistic]: of z if nothing is missing.
+    In the second place is what takes most from the worst group of statistics, which is what `compare` calls the error.
+
+    slopes [parameter, statistic]: shifts by wrong base parameters, which are free; variance [statistic]: of z if
+    nothing is missing.
     """
+    z = evidence.z
     nothing = _loss(z, slopes, variance)
     listed = {candidate.name: candidate for candidate in ranking}
     found = []
@@ -36,7 +41,33 @@ def nearest(
         loss, amplitude, detail = _best(of, z, slopes, variance)
         if nothing - loss > LEAST_GAIN:
             found.append((loss, replace(listed[of.name], effect=made(of.maker, amplitude, detail))))
-    return tuple(candidate for _, candidate in sorted(found, key=lambda pair: pair[0]))
+    ordered = [candidate for _, candidate in sorted(found, key=lambda pair: pair[0])]
+    of_worst = _of_worst_group(prints, listed, evidence)
+    if of_worst is None or of_worst.name in [one.name for one in ordered[:1]]:
+        return tuple(ordered)
+    return (*ordered[:1], of_worst, *(one for one in ordered[1:] if one.name != of_worst.name))
+
+
+def _of_worst_group(
+    prints: Iterable[Fingerprint], listed: dict[str, Candidate], evidence: Evidence
+) -> Candidate | None:
+    """The candidate that takes most from the misfit of the worst group; None if none takes half of it."""
+    misfit = misfits(evidence.z, evidence.groups)
+    worst = max(misfit, key=misfit.__getitem__)
+    of_group = np.array(evidence.groups) == worst
+    left, of, amplitude, detail = min(
+        (
+            (float(np.mean((evidence.z - shift)[of_group] ** 2)), of, float(amplitude), detail)
+            for of in prints
+            for amplitude in GRID[::2]
+            for detail, shift in enumerate(of.at(float(amplitude)))
+        ),
+        key=lambda tried: tried[0],
+    )
+    gain = misfit[worst] - left
+    if gain < LEAST_SHARE * misfit[worst] or gain * of_group.sum() / 2 < LEAST_GAIN:
+        return None
+    return replace(listed[of.name], effect=made(of.maker, amplitude, detail))
 
 
 def _best(of: Fingerprint, z: np.ndarray, slopes: np.ndarray, variance: np.ndarray) -> tuple[float, float, int]:

@@ -18,7 +18,7 @@ from hsnoise.criticism import candidates as library
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
-from hsnoise.criticism.improve import Step, _is_better, _is_there, _is_too_little, _Work, together
+from hsnoise.criticism.improve import Step, _is_there, _is_too_little, _left_out, _why_worse, _Work, together
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -289,21 +289,34 @@ def test_bad_input_is_refused(call, error, message):
 
 
 @pytest.mark.parametrize(
-    ("groups", "held_out", "better"),
+    ("groups", "held_out", "converged", "worse"),
     [
-        ({"frames": 36.0, "columns": 1.0}, 50.0, True),  # the worst group waits for another effect
-        ({"frames": 36.0, "columns": 1.0}, -1.0, False),  # by chance: frames that no fit has seen do not fit better
-        ({"frames": 36.0, "columns": 21.0}, 50.0, False),  # nothing gained
-        ({"frames": 60.0, "columns": 1.0}, 50.0, False),  # much worse elsewhere
-        ({"frames": 30.0, "columns": 20.0}, -50.0, False),  # frames that no fit has seen fit worse
+        ({"frames": 36.0, "columns": 1.0}, 50.0, True, ""),  # the worst group waits for another effect
+        ({"frames": 36.0, "columns": 1.0}, -1.0, True, "held-out frames fit worse with it, by 1.0 nats"),  # by chance
+        ({"frames": 36.0, "columns": 21.0}, 50.0, True, "statistics fit worse with it (error 17.5 -> 18)"),
+        ({"frames": 60.0, "columns": 1.0}, 50.0, True, "statistics fit worse with it (error 17.5 -> 30)"),
+        ({"frames": 30.0, "columns": 20.0}, -50.0, True, "held-out frames fit worse with it, by 50.0 nats"),
+        ({"frames": 30.0, "columns": 20.0}, 50.0, False, "no fit with it converged"),  # its numbers say little
+        ({"frames": 8.0, "columns": 8.0}, 50.0, False, ""),  # nor need they, where so much is explained
+        ({"frames": 8.0, "columns": 8.0}, np.nan, True, ""),  # nothing held out
     ],
 )
-def test_an_addition_is_judged_by_all_groups(groups, held_out, better):
-    def step(groups, held_out):
+def test_an_addition_is_judged_by_all_groups(groups, held_out, converged, worse):
+    def step(groups, held_out, converged=True):
         comparison = SimpleNamespace(error=max(groups.values()) / 2, groups=groups)
-        return Step(SimpleNamespace(params=MODEL), comparison, None, None, held_out, ())
+        return Step(SimpleNamespace(params=MODEL, converged=converged), comparison, None, None, held_out, ())
 
-    assert _is_better(step(groups, held_out), step({"frames": 35.0, "columns": 20.0}, 0.0)) is better
+    said = _why_worse(step(groups, held_out, converged), step({"frames": 35.0, "columns": 20.0}, 0.0))
+    assert said.startswith(worse) and bool(said) is bool(worse)
+
+
+def test_what_was_tried_in_vain_is_told_with_the_reason():
+    refused = {"row_noise": "came out compatible with zero", "hot_pixels": "could not be fitted"}
+    found = SimpleNamespace(verdict="unexplained", names=(), advice="")
+    said = _left_out(refused, found, SimpleNamespace(error=7.0))
+    assert "left out: row_noise came out compatible with zero; hot_pixels could not be fitted." in said
+    assert "no effect of the library explains (error 7.00)" in said
+    assert "error is 1.20, as chance gives" in _left_out(refused, found, SimpleNamespace(error=1.2))
 
 
 @pytest.mark.parametrize(

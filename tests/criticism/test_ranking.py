@@ -175,11 +175,24 @@ def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are()
     ranking = [one.candidate(found) for one in judged]
     assert [one.name for one in ranking] == ["wide", "left"]  # by normal laws, far from any of them
     no_base, ones = np.zeros((1, STATISTICS)), np.ones(STATISTICS)
-    assert nearest(prints, ranking, z, no_base, ones)[0].name == "left"
+    assert nearest(prints, ranking, found, no_base, ones)[0].name == "left"
     # What a wrong base parameter would do is no gain.
     base = PRINTS[0].at(1.0).mean(0)[None]
-    assert "left" not in [one.name for one in nearest(prints, ranking, z, base, ones)]
-    assert nearest(prints, ranking, evidence().z, no_base, ones) == ()
+    assert "left" not in [one.name for one in nearest(prints, ranking, found, base, ones)]
+    assert nearest(prints, ranking, evidence(), no_base, ones) == ()
+
+
+def test_what_takes_most_from_the_worst_group_is_tried_after_what_explains_most_statistics():
+    """Many statistics are a little off, a few by far: what `compare` calls the error is theirs."""
+    many, other = fingerprint("many", slice(0, 18)), fingerprint("other", slice(18, 25))
+    few = fingerprint("few", slice(31, 34), 90.0)
+    found = evidence(many, few, other)
+    prints = [many, other, few]
+    ranking = [judge(of, found).candidate(found) for of in prints]
+    no_base, ones = np.zeros((1, STATISTICS)), np.ones(STATISTICS)
+    assert [one.name for one in nearest(prints, ranking, found, no_base, ones)] == ["many", "few", "other"]
+    without = [one.name for one in nearest(prints[:2], ranking, found, no_base, ones)]
+    assert without == ["many", "other"]  # neither takes half of what is off there
 
 
 def test_rare_statistics_that_go_with_others_leave_a_law():
