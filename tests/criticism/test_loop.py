@@ -310,6 +310,27 @@ def test_an_addition_is_judged_by_all_groups(groups, held_out, converged, worse)
     assert said.startswith(worse) and bool(said) is bool(worse)
 
 
+def test_candidates_are_tried_until_one_holds(monkeypatch):
+    effects = {"row_noise": fx.RowNoise(1.0), "frame_offset": fx.FrameOffset(1.0), "column_noise": fx.ColumnNoise(1.0)}
+    effects["hot_pixels"] = fx.HotPixels(0.01, 9.0)
+    candidates, told = [SimpleNamespace(name=name, effect=effect) for name, effect in effects.items()], []
+    step, tried = SimpleNamespace(), []
+    why = {"frame_offset": "changed nothing by itself", "column_noise": ""}
+
+    def with_one_more(self, steps, candidate):
+        tried.append(candidate.name)
+        return None if candidate.name == "row_noise" else step
+
+    monkeypatch.setattr(_Work, "with_one_more", with_one_more)
+    monkeypatch.setattr(_Work, "refusal", lambda self, effect, step, before: why[effect.name])
+    work, steps = _Work(None, None, 0, told.append), [SimpleNamespace()]
+    reasons = {"row_noise": "could not be fitted", "frame_offset": "changed nothing by itself"}
+    assert work.first_that_holds(candidates, steps) == (step, reasons)
+    assert tried == ["row_noise", "frame_offset", "column_noise"]
+    assert told == ["row_noise is left out, could not be fitted", "frame_offset is left out, changed nothing by itself"]
+    assert work.first_that_holds(candidates[:2], steps) == (None, reasons)
+
+
 def test_what_was_tried_in_vain_is_told_with_the_reason():
     refused = {"row_noise": "came out compatible with zero", "hot_pixels": "could not be fitted"}
     found = SimpleNamespace(verdict="unexplained", names=(), advice="")
