@@ -22,6 +22,7 @@ JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
 LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons of white, or lux
 NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
+Shape = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,16 @@ OPTICS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera to train for: its noise, photoelectrons of white in dim and in bright scenes, its optics if known."""
+    """A camera to train for: its noise, photoelectrons of white in dim and in bright scenes, its optics if known.
+
+    sensor: rows and columns of its frames, of which those that are drawn are a piece; None: each is a frame.
+    """
 
     name: str
     model: NoiseModel
     white_e: tuple[float, float]
     optics: Optics | None = None
+    sensor: Shape | None = None
 
     @property
     def channels(self) -> int:
@@ -186,10 +191,25 @@ def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseMod
     return model
 
 
-def noisy_of(key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e) -> jax.Array:
+def noisy_of(
+    key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e, sensor: Shape | None = None
+) -> jax.Array:
     """What comes out of frames of light [frame, row, column, channel] (white is 1), in the same units.
 
     noise makes the counts; black level, gain and dark current of `camera` turn them back to light.
+    sensor: as in Camera; the frames lie at a random place of it. Raises ValueError if they are larger.
     """
-    counts = hsnoise.sample(key, mosaic(light * white_e, noise.cfa), noise)
-    return electrons_of(counts, camera) / white_e
+    photons = mosaic(light * white_e, noise.cfa)
+    window = None if sensor is None else _somewhere(named_key(key, "place"), photons.shape, sensor, noise.cfa)
+    return electrons_of(hsnoise.sample(key, photons, noise, window=window), camera) / white_e
+
+
+def _somewhere(key: jax.Array, shape: tuple[int, ...], sensor: Shape, cfa: str) -> tuple:
+    """A window for frames of `shape` at a random place of the sensor, where the Bayer pattern begins."""
+    free = [most - size for most, size in zip(sensor, shape[-2:], strict=True)]
+    if min(free) < 0:
+        asked, came = (f"{rows} x {columns}" for rows, columns in (shape[-2:], sensor))
+        raise ValueError(f"--sensor: expected at least the {asked} pixels of a piece of a frame, got {came}")
+    period, keys = len(cfa_tile(cfa)), jax.random.split(key)
+    first = (period * jax.random.randint(k, (), 0, n // period + 1) for k, n in zip(keys, free, strict=True))
+    return (*first, *sensor)

@@ -64,7 +64,7 @@ class Trainer:
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter)
+        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter, camera.sensor)
         self._step = eqx.filter_jit(fixed, donate="none")
 
     def start(self, seed: int) -> tuple[STLSTM, Any]:
@@ -94,9 +94,9 @@ def sharding_of_batches() -> jax.sharding.NamedSharding | None:
     return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
 
 
-def _step(optimiser, perceptual, checkpoint, jitter, state, batch, key, camera, noise, light):
+def _step(optimiser, perceptual, checkpoint, jitter, sensor, state, batch, key, camera, noise, light):
     net, memory = state
-    clean, noisy = examples(batch, key, camera, noise, light, jitter)
+    clean, noisy = examples(batch, key, camera, noise, light, jitter, sensor)
 
     def value_of(net: STLSTM) -> jax.Array:
         enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
@@ -108,18 +108,25 @@ def _step(optimiser, perceptual, checkpoint, jitter, state, batch, key, camera, 
 
 
 def examples(
-    batch, key, camera: NoiseModel, noise: NoiseModel, light, jitter: float = JITTER
+    batch,
+    key,
+    camera: NoiseModel,
+    noise: NoiseModel,
+    light,
+    jitter: float = JITTER,
+    sensor: tuple[int, int] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
 
-    Each example has a camera of its own, off by `jitter`, and a scene between the photoelectrons of white `light`.
+    Each example has a camera of its own, off by `jitter`, and a scene between the photoelectrons of white `light` and a
+    place of its own on the sensor (rows, columns), if that is given.
     """
     linear = light_of_frames(batch, len(camera.channels))
 
     def one(key, linear):
         of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
         white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
-        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e)
+        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e, sensor)
 
     noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
     return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)

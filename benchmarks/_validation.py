@@ -39,7 +39,9 @@ class Validation:
             row, column = ((n - side) // 2 for n in clip.frames.shape[1:3])
             light = light_of_frames(clip.frames[:frames, row : row + side, column : column + side], camera.channels)
             clean.append(np.asarray(display_from_linear(light)))
-            noisy.append(np.asarray(noisy_of(jax.random.key(i), light, camera.model, camera.model, white_e)))
+            noisy.append(
+                np.asarray(noisy_of(jax.random.key(i), light, camera.model, camera.model, white_e, camera.sensor))
+            )
         self.clean, self.noisy = np.stack(clean, 1), np.stack(noisy, 1).astype(np.float32)
         self.refer = psnr_db(np.asarray(display_from_linear(self.noisy)), self.clean)
         self._video = eqx.filter_jit(lambda net, noisy: net.video(noisy))

@@ -12,7 +12,7 @@ import argparse
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import equinox as eqx
@@ -29,7 +29,7 @@ from benchmarks._rivals import denoised, rivals, tuned
 from benchmarks._sheet import Sheet
 from benchmarks._training import digest_of
 from benchmarks._validation import psnr_db
-from benchmarks.train import pair
+from benchmarks.train import pair, shape_of
 from hsnoise._output import write_atomically, write_figure
 from hsnoise.photometry import display_from_linear, light_of_frames, linear_from_display
 from hsnoise.stlstm import STLSTM
@@ -61,7 +61,7 @@ def scene_of(clip: Clip, camera: Camera, white_e: float, crop: int, seed: int) -
     side = [min(crop, n) // 2 * 2 for n in clip.frames.shape[1:3]]
     row, column = ((n - s) // 2 for n, s in zip(clip.frames.shape[1:3], side, strict=True))
     light = light_of_frames(clip.frames[:, row : row + side[0], column : column + side[1]], camera.channels)
-    noisy = noisy_of(jax.random.key(seed), light, camera.model, camera.model, white_e)
+    noisy = noisy_of(jax.random.key(seed), light, camera.model, camera.model, white_e, camera.sensor)
     return Scene(clip.name, white_e, np.asarray(display_from_linear(light)), np.asarray(noisy, np.float32))
 
 
@@ -93,7 +93,8 @@ def camera_for(about: dict, options: argparse.Namespace) -> Camera:
     white_e = options.white_e
     if white_e is None and options.lux is None and "white_e" in about:
         white_e = tuple(about["white_e"])
-    camera = camera_of(name, options.lux, white_e, options.exposure)
+    sensor = options.sensor or (tuple(about["sensor"]) if about.get("sensor") else None)
+    camera = replace(camera_of(name, options.lux, white_e, options.exposure), sensor=sensor)
     if about.get("digests", {}).get("camera") != digest_of(camera.model):
         print(f"Note: {options.weights} was trained for another camera ({about.get('camera')}) than {camera.name}")
     return camera
@@ -235,6 +236,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--lux", type=pair, help="illuminance of the scene: low,high (default: that of the training)")
     add("--white-e", type=pair, help="or photoelectrons of white: low,high")
     add("--exposure", type=float, help="of a video frame, s, with a model.json (default: the model's own)")
+    add("--sensor", type=shape_of, help="ROWSxCOLUMNS of the camera's frames (default: that of the training)")
     add("--crop", type=int, default=160, help="side of the middle of each frame that is scored (default 160)")
     add("--no-rivals", action="store_true", help="score the enhancer and the scaled input only")
     add("--out", type=Path, default=Path("build/evaluate"), help="default: build/evaluate")

@@ -167,7 +167,7 @@ def drawn_darks(noise: NoiseModel) -> np.ndarray:
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Weights of a network that was trained with the noise called `name`."""
     camera = levelled(camera, level_of(drawn_darks(noise)))
-    sizes = (options.stride, options.side, options.jitter)
+    sizes = (options.stride, options.side, options.jitter, camera.sensor)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
@@ -188,7 +188,7 @@ def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, opti
 
 def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
     sigma = sensor.dark_sigma_e(paper)
-    camera = Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma))
+    camera = Camera(sensor.name, paper, (DIM * sigma, BRIGHT * sigma), sensor=sensor.fitted.shape)
     return levelled(camera, level_of(sensor.fitted_darks))
 
 

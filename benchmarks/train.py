@@ -35,6 +35,10 @@ SHOWN_EVERY = 10
 ENDED, DESCRIBED = "weights.eqx", "run.json"
 LOGGED = ["step", "loss", "psnr_db", "input_psnr_db"]
 MOST_SEED = 2**32 - 1
+SENSOR_HELP = (
+    "ROWSxCOLUMNS of the camera's frames, for noise that depends on the place (glow, taps, shading): pieces lie"
+    " anywhere in them (default: each piece is a whole frame)"
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     """Train, or go on training; returns the weights file."""
     preset = chosen_preset(options)
     perceptual, vgg = perceptual_of(options.vgg, console)
-    camera = camera_of(options.camera, options.lux, options.white_e, options.exposure)
+    camera = replace(camera_of(options.camera, options.lux, options.white_e, options.exposure), sensor=options.sensor)
     noise = noise_of(options.noise, camera)
     train, kept = held_out(read_clips(options.clips))
     check_sizes([*train, *kept], preset.frames, preset.side)
@@ -101,6 +105,7 @@ def description(preset: Preset, camera, noise, train, kept, options: argparse.Na
         "camera": camera.name,
         "noise": options.noise,
         "white_e": list(camera.white_e),
+        "sensor": None if camera.sensor is None else list(camera.sensor),
         "seed": options.seed,
         "clips": [clip.name for clip in train],
         "held_out": [clip.name for clip in kept],
@@ -246,6 +251,14 @@ def pair(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(f"expected a number or low,high, got {text!r}") from None
 
 
+def shape_of(text: str) -> tuple[int, int]:
+    """Rows and columns of 3000x4000."""
+    rows, _, columns = text.partition("x")
+    if not (rows.isdecimal() and columns.isdecimal() and int(rows) and int(columns)):
+        raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS, such as 3000x4000, got {text!r}")
+    return int(rows), int(columns)
+
+
 def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = top.add_argument
@@ -260,6 +273,7 @@ def parser() -> argparse.ArgumentParser:
     add("--lux", type=pair, help="illuminance of the scene: low,high (default: the paper's for the camera)")
     add("--white-e", type=pair, help="or photoelectrons of white: low,high")
     add("--exposure", type=float, help="of a video frame, s, with a model.json (default: the model's own)")
+    add("--sensor", type=shape_of, help=SENSOR_HELP)
     add("--vgg", type=Path, help="torchvision's VGG-16 weights (.safetensors or .pth) for the perceptual term")
     add("--steps", type=int, help="instead of the preset's")
     add("--seed", type=int, default=0, help="default: 0")

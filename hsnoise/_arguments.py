@@ -143,6 +143,19 @@ def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
+def piece_of(window: Any, shape: tuple[int, ...], cfa: str) -> tuple[tuple[Any, Any], tuple[int, int]]:
+    """First row and column of frames of `shape` on a sensor, which may be traced, and its rows and columns.
+
+    Raises TypeError, ValueError for a window that is none or does not hold the frames, or begins at another colour.
+    """
+    numbers = listed("window", window, "four whole numbers")
+    found = window_of([0 if is_traced(n) else n for n in numbers], shape)
+    if cfa != "mono" and (found[0] % 2 or found[1] % 2):
+        raise ValueError(f"window: expected even first rows and columns with a Bayer array ({cfa}), got {window}")
+    row, column = (n if is_traced(n) else known for n, known in zip(numbers[:2], found, strict=False))
+    return (row, column), found[2:]
+
+
 def exposure_groups(counts: Any) -> tuple[Any, ...]:
     """Counts as one array-like `[frame, row, column]` an exposure, sizes not yet compared."""
     if isinstance(counts, np.ma.MaskedArray) or (

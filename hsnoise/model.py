@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise._arguments import check_key, checked_exposure, checked_light, listed, whole_number
+from hsnoise._arguments import check_key, checked_exposure, checked_light, listed, piece_of, whole_number
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import named_key
 from hsnoise._output import write_atomically
@@ -206,6 +206,7 @@ def sample(
     *,
     exposure_s: float | Scalar | None = None,
     sensor_key: RandomKey | None = None,
+    window: tuple[Any, Any, int, int] | None = None,
     differentiable: bool = False,
 ) -> Array:
     """Draw what the sensor makes of a clean image: counts in DN.
@@ -221,6 +222,9 @@ def sample(
         exposure_s: exposure in seconds; that of the model by default.
         sensor_key: key from which fixed patterns are drawn; the same key is the same sensor. By default derived
             from `key`, so that each call is another sensor of the same make.
+        window: (first row, first column, rows, columns) where the frames are a piece of a larger sensor, for effects
+            that depend on the place (glow, taps, shading); under jit the first two may be traced. Row gains and row
+            noise run over the rows of the piece.
         differentiable: the same counts as floats, with derivatives by `clean` and the parameters. Clipping stops
             them, rounding does not. The derivatives by light and dark current need read noise, with nothing but
             effects that add electrons before it.
@@ -232,14 +236,18 @@ def sample(
     Raises:
         TypeError: if `params` is no NoiseModel, `key` no random key, or `clean` does not hold real numbers.
         ValueError: if `clean` has fewer than two dimensions, no pixels, odd sizes with a Bayer array, or
-            negative or non-finite values; if the exposure is negative or not one number. (Under jit, values
-            cannot be checked.)
+            negative or non-finite values; if the exposure is negative or not one number; if the window does not
+            hold the frames. (Under jit, values cannot be checked.)
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
     """
     light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
     capture = dataclasses.replace(capture, differentiable=differentiable)
+    if window is not None:
+        first, sensor = piece_of(window, capture.shape, params.cfa)
+        moved = jnp.asarray(first[0], jnp.int32), jnp.asarray(first[1], jnp.int32)
+        capture = dataclasses.replace(capture, window=(0, 0, *sensor), moved=moved)
     inside_another = any(is_traced(leaf) for leaf in jax.tree.leaves((key, light, effects, capture)))
     apply = apply_fenced if inside_another and not differentiable else apply_in_one
     return apply(key, light, shape, effects, capture).reshape(np.shape(clean))

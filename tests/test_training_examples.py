@@ -16,7 +16,7 @@ from benchmarks._training import batch_rng, examples
 from benchmarks._validation import Validation
 from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
 from hsnoise._types import cfa_tile
-from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
+from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise, TapOffsets
 
 
 def test_a_short_clip_is_played_forth_and_back():
@@ -42,6 +42,23 @@ def test_examples_have_the_light_of_the_clip_as_their_mean():
     np.testing.assert_allclose(clean, 188 / 255, atol=1e-5)
     # Cameras are 10 % off, which the conversion does not know.
     assert float(noisy.mean()) == pytest.approx(0.503, rel=0.15)
+
+
+def test_pieces_lie_anywhere_on_the_sensor():
+    """Taps of 16 columns: a piece of 24 colour pixels has at most four of them, not eight."""
+    effects = [Gain(1.0), TapOffsets(1000.0, taps=8), BlackLevel(0.0)]
+    model = hsnoise.NoiseModel(effects, cfa="mono", shutter="global", exposure_s=0.1)
+    batch = np.zeros((16, 1, 24, 24, 3), np.uint8)
+    light = np.float32([1, 1])
+    _, noisy = examples(batch, jax.random.key(0), model, model, light, 0.0, (64, 128))
+    rows = np.asarray(noisy)[:, 0, 0, :, 0]
+    edges = [np.flatnonzero(np.diff(row)) for row in rows]
+    assert all(0 < len(one) <= 2 and set(np.diff(one)) <= {16} for one in edges)
+    assert len({one[0] for one in edges}) > 4
+    _, whole = examples(batch, jax.random.key(0), model, model, light, 0.0)
+    assert {len(np.flatnonzero(np.diff(row))) for row in np.asarray(whole)[:, 0, 0, :, 0]} == {7}
+    with pytest.raises(ValueError, match="--sensor: expected at least the 24 x 24 pixels"):
+        examples(batch, jax.random.key(0), model, model, light, 0.0, (16, 128))
 
 
 def test_held_out_videos_are_held_out_with_their_long_cuts():

@@ -138,6 +138,7 @@ class Capture(eqx.Module):
         dark_current_scale: factor on the dark current of each pixel, as above.
         differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
+        moved: rows and columns by which they lie further down and to the right than that; None for 0.
     """
 
     exposure_s: Scalar
@@ -150,16 +151,21 @@ class Capture(eqx.Module):
     gain: PerChannel | None = None
     differentiable: bool = eqx.field(static=True, default=False)
     window: Window | None = eqx.field(static=True, default=None)
+    moved: tuple[jax.Array, jax.Array] | None = None
 
     @property
-    def rows(self) -> np.ndarray:
+    def rows(self) -> np.ndarray | jax.Array:
         """Numbers of the frames' rows on the sensor."""
-        return np.arange(self.shape[0]) + (0 if self.window is None else self.window[0])
+        return self._lines(0)
 
     @property
-    def columns(self) -> np.ndarray:
+    def columns(self) -> np.ndarray | jax.Array:
         """Numbers of the frames' columns on the sensor."""
-        return np.arange(self.shape[1]) + (0 if self.window is None else self.window[1])
+        return self._lines(1)
+
+    def _lines(self, axis: int) -> np.ndarray | jax.Array:
+        lines = np.arange(self.shape[axis]) + (0 if self.window is None else self.window[axis])
+        return lines if self.moved is None else lines + self.moved[axis]
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
