@@ -32,6 +32,7 @@ THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is adde
 LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
 NEEDED = 0.1  # share of the misfit of some group, at least, that comes back without an effect
 WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
+CLEARLY_LESS = 0.95  # of the misfit of all groups together, where that of the worst one grows
 CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
 MOVED_SIGMA = 2.0
 SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is
@@ -292,7 +293,7 @@ def _why_worse(step: Step, before: Step) -> str:
     allowed = WORSE
     if after.error > until_now.error:
         # The worst group may be that of another effect, which is still missing and does not stand quite still.
-        less = sum(after.groups.values()) < sum(until_now.groups.values())
+        less = sum(after.groups.values()) < CLEARLY_LESS * sum(until_now.groups.values())
         if not less or after.error > CHANGE_OF_OTHERS * until_now.error:
             return f"statistics fit worse with it (error {until_now.error:.3g} -> {after.error:.3g})"
         allowed = 0.0

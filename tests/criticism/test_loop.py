@@ -293,6 +293,7 @@ def test_bad_input_is_refused(call, error, message):
     [
         ({"frames": 36.0, "columns": 1.0}, 50.0, True, ""),  # the worst group waits for another effect
         ({"frames": 36.0, "columns": 1.0}, -1.0, True, "held-out frames fit worse with it, by 1.0 nats"),  # by chance
+        ({"frames": 36.0, "columns": 18.0}, 50.0, True, "statistics fit worse with it (error 17.5 -> 18)"),  # as well
         ({"frames": 36.0, "columns": 21.0}, 50.0, True, "statistics fit worse with it (error 17.5 -> 18)"),
         ({"frames": 60.0, "columns": 1.0}, 50.0, True, "statistics fit worse with it (error 17.5 -> 30)"),
         ({"frames": 30.0, "columns": 20.0}, -50.0, True, "held-out frames fit worse with it, by 50.0 nats"),
