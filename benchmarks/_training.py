@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks._noisy import JITTER, Camera, jittered, noisy_of
+from benchmarks._noisy import JITTER, Camera, Shape, jittered, noisy_of
 from hsnoise import NoiseModel
 from hsnoise._keys import named_key
 from hsnoise.photometry import display_from_linear, light_of_frames
@@ -114,12 +114,12 @@ def examples(
     noise: NoiseModel,
     light,
     jitter: float = JITTER,
-    sensor: tuple[int, int] | None = None,
+    sensor: Shape | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
 
-    Each example has a camera of its own, off by `jitter`, and a scene between the photoelectrons of white `light` and a
-    place of its own on the sensor (rows, columns), if that is given.
+    Each example has a camera of its own, off by `jitter`, a scene between the photoelectrons of white `light`, and a
+    place on the sensor, as in Camera.
     """
     linear = light_of_frames(batch, len(camera.channels))
 

@@ -45,7 +45,7 @@ def test_examples_have_the_light_of_the_clip_as_their_mean():
 
 
 def test_pieces_lie_anywhere_on_the_sensor():
-    """Taps of 16 columns: a piece of 24 colour pixels has at most four of them, not eight."""
+    """Taps of 16 columns: a piece of 24 colour pixels has at most three of them, not eight."""
     effects = [Gain(1.0), TapOffsets(1000.0, taps=8), BlackLevel(0.0)]
     model = hsnoise.NoiseModel(effects, cfa="mono", shutter="global", exposure_s=0.1)
     batch = np.zeros((16, 1, 24, 24, 3), np.uint8)

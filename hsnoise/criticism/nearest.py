@@ -7,7 +7,7 @@ statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,11 @@ LEAST_SHARE = 0.5  # of the misfit of the worst group, at least, that an effect 
 
 
 def nearest(
-    prints: Sequence[Fingerprint], ranking: Iterable[Candidate], evidence: Evidence, slopes: np.ndarray, variance
+    prints: Sequence[Fingerprint],
+    ranking: Iterable[Candidate],
+    evidence: Evidence,
+    slopes: np.ndarray,
+    variance: np.ndarray,
 ) -> tuple[Candidate, ...]:
     """Candidates of the ranking by what they gain, the best first, with parameters of that gain.
 
@@ -38,7 +42,7 @@ def nearest(
     listed = {candidate.name: candidate for candidate in ranking}
     found = []
     for of in prints:
-        loss, amplitude, detail = _best(of, z, slopes, variance)
+        loss, amplitude, detail = _best(of, lambda shift: _loss(z - shift, slopes, variance))
         if nothing - loss > LEAST_GAIN:
             found.append((loss, replace(listed[of.name], effect=made(of.maker, amplitude, detail))))
     ordered = [candidate for _, candidate in sorted(found, key=lambda pair: pair[0])]
@@ -55,25 +59,21 @@ def _of_worst_group(
     misfit = misfits(evidence.z, evidence.groups)
     worst = max(misfit, key=misfit.__getitem__)
     of_group = np.array(evidence.groups) == worst
-    left, of, amplitude, detail = min(
-        (
-            (float(np.mean((evidence.z - shift)[of_group] ** 2)), of, float(amplitude), detail)
-            for of in prints
-            for amplitude in GRID[::2]
-            for detail, shift in enumerate(of.at(float(amplitude)))
-        ),
-        key=lambda tried: tried[0],
-    )
+
+    def misfit_with(shift: np.ndarray) -> float:
+        return float(np.mean((evidence.z - shift)[of_group] ** 2))
+
+    (left, amplitude, detail), of = min(((_best(of, misfit_with), of) for of in prints), key=lambda pair: pair[0])
     gain = misfit[worst] - left
     if gain < LEAST_SHARE * misfit[worst] or gain * of_group.sum() / 2 < LEAST_GAIN:
         return None
     return replace(listed[of.name], effect=made(of.maker, amplitude, detail))
 
 
-def _best(of: Fingerprint, z: np.ndarray, slopes: np.ndarray, variance: np.ndarray) -> tuple[float, float, int]:
-    """Least loss over amplitudes and details: (loss, amplitude, detail)."""
+def _best(of: Fingerprint, loss: Callable[[np.ndarray], float]) -> tuple[float, float, int]:
+    """Least loss of the shifts [statistic] at all amplitudes and details: (loss, amplitude, detail)."""
     return min(
-        (_loss(z - shift, slopes, variance), float(amplitude), detail)
+        (loss(shift), float(amplitude), detail)
         for amplitude in GRID[::2]
         for detail, shift in enumerate(of.at(float(amplitude)))
     )
