@@ -21,7 +21,7 @@ from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import WITH_LIKELIHOOD, fit, without_likelihood
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult, rounded
+from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
@@ -146,7 +146,7 @@ def together(before: Step, after: Step) -> str:
     if after.comparison.error <= before.comparison.error:
         return ""
     sums = [sum(step.comparison.groups.values()) for step in (before, after)]
-    return f", misfit of all groups together {sums[0]:.3g} -> {sums[1]:.3g}"
+    return f", misfit of all groups together {number(sums[0])} -> {number(sums[1])}"
 
 
 def improve(
@@ -288,14 +288,15 @@ def _why_worse(step: Step, before: Step) -> str:
     # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
     unseen = not (np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params))
     gained, after, until_now = step.held_out - before.held_out, step.comparison, before.comparison
+    went = f"{number(until_now.error)} -> {number(after.error)}"
     if not step.fit.converged and after.error * CHANGE_OF_OTHERS > until_now.error > CHANCE_ERROR:
-        return f"no fit with it converged, and the error hardly fell ({until_now.error:.3g} -> {after.error:.3g})"
+        return f"no fit with it converged, and the error hardly fell ({went})"
     allowed = WORSE
     if after.error > until_now.error:
         # The worst group may be that of another effect, which is still missing and does not stand quite still.
         less = sum(after.groups.values()) < CLEARLY_LESS * sum(until_now.groups.values())
         if not less or after.error > CHANGE_OF_OTHERS * until_now.error:
-            return f"statistics fit worse with it (error {until_now.error:.3g} -> {after.error:.3g})"
+            return f"statistics fit worse with it (error {went})"
         allowed = 0.0
     return f"held-out frames fit worse with it, by {-gained:.1f} nats" if unseen and gained <= allowed else ""
 
