@@ -1,9 +1,9 @@
 """How pixels differ: the distribution of dark current and of offsets over pixels, the noise of estimation taken off.
 
 Dark current is modelled as the effects that draw it: log-normal, and in a fraction of hot pixels an exponential extra
-(`dark_current_nonuniformity`, `hot_pixels`), fitted to the measured growth of all pixels by maximum likelihood, the
-known noise of a pixel's growth being part of the distribution. Offsets are normal, from the covariance of two halves of the
-frames, which noise does not enter.
+(`dark_current_nonuniformity`, `hot_pixels`), fitted to the measured growth of all pixels by maximum likelihood; the
+known noise of a pixel's growth is part of the distribution. Offsets are normal, from the covariance of two halves of
+the frames, which noise does not enter.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
 
 
 def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
-    """Share of pixels whose measured growth is below x: log-normal about `mean`, plus exponential in a fraction, plus noise."""
+    """Share of pixels whose measured growth is below x: log-normal, in a fraction plus exponential, plus noise."""
     z, weight = np.polynomial.hermite_e.hermegauss(NODES)
     body = mean * np.exp(spread * z - spread**2 / 2)
     off = (x[:, None] - body) / noise
