@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,12 +13,13 @@ from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
 from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise.flat_gain import judged
 from hsnoise.line import line_fit
 from hsnoise.maximise import maximise
 from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
-from hsnoise.physics import Physics, physics_of
+from hsnoise.physics import Physics, flat_gain_of, physics_of
 from hsnoise.profile import profile_errors
 from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import as_stack
@@ -86,6 +89,7 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         )
     with jax.enable_x64(True):
         start = start_physics(summary, with_row_gain, with_clamp)
+        summary = _with_judged_flats(summary, start)
         if model is not None and "dark_current" not in model:
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
         if method == "line":
@@ -103,6 +107,13 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         if method == "ml" or with_clamp:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+
+
+def _with_judged_flats(summary: Summary, start: Physics) -> Summary:
+    """The curve of the flats' variance and what each level weighs come before the likelihood, which is given both."""
+    if summary.flats is None:
+        return summary
+    return replace(summary, flats=judged(summary.flats, flat_gain_of(start, summary.flats)))
 
 
 def _with_outliers(start: Physics, share: np.ndarray) -> Physics:
