@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +37,10 @@ _LONG_READ = 16  # files from which on a progress bar is shown
 Groups = list[list[Recording]]
 
 
-@dataclass(frozen=True)
-class Capture:
-    """A stack, and for each of its groups the recordings that it was made of."""
-
-    stack: FrameStack
-    groups: Groups
-
-
 def read_capture(
     path: Any, *, exposure_s: Any, kind: Any, cfa: str | None, overscan: Any, progress: bool, roi: Any, **keywords: Any
-) -> Capture:
-    """What `hsnoise.load` does, with the files of each group; `keywords` are levels, shutter and row_axis."""
+) -> FrameStack:
+    """What `hsnoise.load` does; `keywords` are levels, shutter and row_axis."""
     read, root, told, source = _recordings(path, progress)
     read, about_kinds = with_kinds(read, kind, root)
     read, about_exposures = _with_exposures(read, exposure_s, root)
@@ -57,20 +49,19 @@ def read_capture(
     found = sort_out(read, root)
     _check_exposures([*found.main, *found.elsewhere], source)
     gain, about_gain = _stated_gain([*found.main, *found.elsewhere])
-    stacks, groups, about_levels = [], [], []
+    stacks, about_levels = [], []
     black_dn = _black_dn(found.main)
     for some, region in ((found.main, roi), (found.elsewhere, None)):
         if some:
             given = keywords["white_level"]
             white_level = _shared(some, "white_level") if given is None else given
             levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
-            groups.append(levels)
             about_levels += about
             stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
             stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
     joined = FrameStack.join(*stacks)
-    return Capture(replaced(joined, assumed=(*assumed, *joined.assumed)), groups[0])
+    return replaced(joined, assumed=(*assumed, *joined.assumed))
 
 
 def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
