@@ -42,8 +42,9 @@ def read_capture(
 ) -> FrameStack:
     """What `hsnoise.load` does; `keywords` are levels, shutter and row_axis."""
     read, root, told, source = _recordings(path, progress)
+    read = read if exposure_s is None else _with_given(read, exposure_s)
     read, about_kinds = with_kinds(read, kind, root)
-    read, about_exposures = _with_exposures(read, exposure_s, root)
+    read, about_exposures = _with_exposures_of_names(read, root)
     if cfa is not None:
         read = [replace(one, cfa=cfa) for one in read]
     found = sort_out(read, root)
@@ -77,13 +78,16 @@ def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[
     return [one for path in tracked for one in reader.read(path)], root, passed + others, reader.EXPOSURE_FROM
 
 
-def _with_exposures(read: list[Recording], exposure_s: Any, root: Path) -> tuple[list[Recording], list[str]]:
-    """Exposures as given, or as the files say, or else as their names do, which is told."""
-    if exposure_s is not None:
-        given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
-        values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
-        _warn_of_other_exposures(read, values)
-        return [replace(recording, exposure_s=value) for recording, value in zip(read, values, strict=True)], []
+def _with_given(read: list[Recording], exposure_s: Any) -> list[Recording]:
+    """Exposures as given; warns if a file says another."""
+    given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
+    values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
+    _warn_of_other_exposures(read, values)
+    return [replace(recording, exposure_s=value) for recording, value in zip(read, values, strict=True)]
+
+
+def _with_exposures_of_names(read: list[Recording], root: Path) -> tuple[list[Recording], list[str]]:
+    """Exposures that only the names of files and folders tell, and a sentence that says so."""
     out = [
         recording
         if recording.exposure_s is not None
