@@ -51,7 +51,7 @@ def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "pixels.jsonl"
     pixels.run(["CCD warm"], 1, 1, "auto", out)
     with out.open("a") as file:
-        file.write('{"kind": "CCD w')
+        file.write('\n{"kind": "CCD w')
     again = pixels.run(["CCD warm"], 2, 1, "auto", out)
     assert len(calls) == 2 and len(again["CCD warm"]) == 2
     assert pixels.run(["CCD warm"], 2, 1, "auto", out) == again and len(calls) == 2
