@@ -1,7 +1,7 @@
 """Captures with something in them that is no dark signal of the sensor: the fit is right, or it says what is wrong.
 
 One row each: gain and read noise come within 3 standard errors or 2 % of the truth, or a sentence of `fit.doubts` names
-what is in the capture, or a ValueError does. An error of more than a tenth of the value is no way to be within three.
+what is in the capture, or a ValueError does. An error of more than a twentieth of the value is no way to be within three.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def off(fit, truth: dict[str, float]) -> dict[str, tuple[float, float, float]]:
     wrong = {}
     for name, true in truth.items():
         value, error, _ = fit.table.get(name, (np.nan, np.nan, ""))
-        near = abs(value - true) < 0.02 * true or (error < 0.1 * true and abs(value - true) < 3 * error)
+        near = abs(value - true) < 0.02 * true or (error < 0.05 * true and abs(value - true) < 3 * error)
         if not near:
             wrong[name] = (true, value, error)
     return wrong
