@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._frames import LazyFrames
-from hsnoise._types import Window, cfa_tile, is_traced
+from hsnoise._types import StatedGain, Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
 MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
@@ -310,11 +310,37 @@ def photons(photons_e: Any, kind: tuple[str, ...]) -> np.ndarray | None:
 
 def temperatures(temperature_c: Any, n: int) -> np.ndarray | None:
     """Temperatures `[exposure]`, degrees Celsius, NaN where unknown; None if all are."""
-    if temperature_c is None:
+    value = np.full(n, temperature_c) if temperature_c is not None and np.ndim(temperature_c) == 0 else temperature_c
+    return _known("temperature_c", value, n)
+
+
+def overscan(overscan_dn: Any, n: int) -> np.ndarray | None:
+    """Overscan means `[exposure]`, DN, NaN where unknown; None if all are."""
+    return _known("overscan_dn", overscan_dn, n)
+
+
+def _known(name: str, value: Any, n: int) -> np.ndarray | None:
+    array = None if value is None else numbers(name, value, n, "exposure")
+    return None if array is None or np.isnan(array).all() else array
+
+
+def stated(stated_gain: Any) -> StatedGain | None:
+    """A header's gain. Raises TypeError for what is no `StatedGain`, ValueError unless it is finite and above 0."""
+    if stated_gain is None:
         return None
-    value = np.full(n, temperature_c) if np.ndim(temperature_c) == 0 else temperature_c
-    celsius = numbers("temperature_c", value, n, "exposure")
-    return None if np.isnan(celsius).all() else celsius
+    if not isinstance(stated_gain, StatedGain):
+        raise TypeError(f"stated_gain: expected a StatedGain or None, got {stated_gain!r}")
+    positive("stated_gain", stated_gain.value_dn_per_e)
+    return stated_gain
+
+
+def sentences(assumed: Any) -> tuple[str, ...]:
+    """What was assumed, a tuple of str. Raises TypeError for anything else."""
+    given = listed("assumed", assumed, "a list of sentences")
+    for one in given:
+        if not isinstance(one, str):
+            raise TypeError(f"assumed: expected sentences, got {one!r}")
+    return given
 
 
 def checked_light(clean, cfa: str):

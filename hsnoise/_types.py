@@ -6,6 +6,8 @@ Bayer sensor are one channel.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt, UInt32
@@ -21,6 +23,19 @@ RandomKey = Key[Array, ""] | UInt32[Array, "2"]
 
 BAYER_CFAS = ("RGGB", "BGGR", "GRBG", "GBRG")
 SHUTTERS = ("rolling", "global")
+
+
+@dataclass(frozen=True)
+class StatedGain:
+    """The gain that a file's header states.
+
+    `source` quotes the header ("EGAIN 2.62 e-/DN"). `certain`: the keyword means electrons per DN and nothing else;
+    GAIN is often the number of a setting.
+    """
+
+    value_dn_per_e: float
+    source: str
+    certain: bool
 
 
 def unit_in_words(unit: str) -> str:

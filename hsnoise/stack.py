@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -19,15 +18,21 @@ from hsnoise._arguments import (
     levels,
     listed,
     one_of,
+    overscan,
     photons,
     positive,
+    sentences,
     span,
+    stated,
     temperatures,
     whole_number,
     window_of,
 )
-from hsnoise._frames import LazyFrames, check_black_level, check_values, crop, read_mapped, shift_cfa, transpose_cfa
-from hsnoise._types import BAYER_CFAS, SHUTTERS, Window, channels_of
+from hsnoise._describing import described
+from hsnoise._frames import check_black_level, crop, read_mapped, shift_cfa, transpose_cfa
+from hsnoise._joining import joined, replaced
+from hsnoise._reading import check_frame, checked, frame_name, in_sensor_orientation, is_dask, while_reading
+from hsnoise._types import BAYER_CFAS, SHUTTERS, StatedGain, Window, channels_of
 
 BATCH = 64  # frames of a Dask array that are handed to its scheduler at a time
 
@@ -54,9 +59,15 @@ class FrameStack:
         row_axis: axis of a stored frame that counts sensor rows: 0, or 1 for frames stored in portrait.
         window: (first row, first column, rows, columns) of the whole sensor where the frames are a part of it and
             effects that depend on the place (glow, taps) are to be told in its coordinates; None: they are all of it.
+        stated_gain: the gain that the files' headers state; None: they state none.
+        overscan_dn: DN, mean of the overscan pixels of each group, which `counts` lack (NaN or None: unknown).
+        elsewhere: flats of the same sensor at the same gain, of another crop or size: only what needs no positions,
+            their photon transfer, can be used. None: there are none.
+        assumed: sentences about what was assumed or set aside when the frames were loaded.
 
     Attributes are the arguments, checked and brought to one shape: `counts` a tuple of arrays (as stored);
-    `exposure_s`, `photons_e` and `temperature_c` arrays `[exposure]`, the last two None if nothing is known;
+    `exposure_s`, `photons_e`, `temperature_c` and `overscan_dn` arrays `[exposure]`, the last three None if nothing is
+    known;
     `black_level` None, a float or an array `[channel]`; `kind` a tuple. `cfa` and `shape` are in sensor
     orientation, that of `frames`.
 
@@ -77,6 +88,10 @@ class FrameStack:
     iso: float | None
     row_axis: int
     window: Window | None
+    stated_gain: StatedGain | None
+    overscan_dn: np.ndarray | None
+    elsewhere: FrameStack | None
+    assumed: tuple[str, ...]
 
     def __init__(
         self,
@@ -93,6 +108,10 @@ class FrameStack:
         iso: float | None = None,
         row_axis: int = 0,
         window: Window | None = None,
+        stated_gain: StatedGain | None = None,
+        overscan_dn: Any = None,
+        elsewhere: FrameStack | None = None,
+        assumed: Sequence[str] = (),
     ):
         groups = exposure_groups(counts)
         row_axis = one_of("row_axis", row_axis, (0, 1))
@@ -113,6 +132,10 @@ class FrameStack:
             "iso": None if iso is None else positive("iso", iso),
             "row_axis": row_axis,
             "window": window_of(window, groups[0].shape[1:] if row_axis == 0 else groups[0].shape[:0:-1]),
+            "stated_gain": stated(stated_gain),
+            "overscan_dn": overscan(overscan_dn, len(groups)),
+            "elsewhere": _flats_elsewhere(elsewhere, cfa),
+            "assumed": sentences(assumed),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -156,7 +179,7 @@ class FrameStack:
         if isinstance(counts, np.memmap):
             frame = read_mapped(counts, number)
         else:
-            with _while_reading(frame_name(self, exposure, number)):
+            with while_reading(frame_name(self, exposure, number)):
                 frame = np.asarray(counts[number])
         if self.is_lazy(exposure):
             check_frame(frame, self, exposure=exposure, frame_number=number)
@@ -188,13 +211,13 @@ class FrameStack:
             numbers = chosen[start : start + BATCH]
             names = [frame_name(self, exposure, number) for number in numbers]
             tasks = [
-                dask.delayed(_checked)(counts[number], name, self.white_level, self.row_axis, function)
+                dask.delayed(checked)(counts[number], name, self.white_level, self.row_axis, function)
                 for number, name in zip(numbers, names, strict=True)
             ]
             while combine is not None and len(tasks) > 1:
                 pairs = zip(tasks[::2], tasks[1::2], strict=False)
                 tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
-            with _while_reading(names[0]):
+            with while_reading(names[0]):
                 results = dask.compute(*tasks)
             yield from results
 
@@ -254,11 +277,12 @@ class FrameStack:
             "kind": [self.kind[i] for i in groups],
             "photons_e": None if self.photons_e is None else self.photons_e[groups],
             "temperature_c": None if self.temperature_c is None else self.temperature_c[groups],
+            "overscan_dn": None if self.overscan_dn is None else self.overscan_dn[groups],
         }
         if self.window is not None:
             row, column, *sensor = self.window
             changes["window"] = (row + rows.start, column + columns.start, *sensor)
-        return FrameStack(**{**self._arguments(), **changes})
+        return replaced(self, **changes)
 
     def _groups(self, exposures: Any) -> np.ndarray:
         """Indices of exposure groups. Raises TypeError for what is no list, ValueError for those that there are not."""
@@ -272,107 +296,32 @@ class FrameStack:
     def join(*stacks: FrameStack) -> FrameStack:
         """The exposures of several stacks of one camera (darks and flats, say) in one, in the order given.
 
+        Flats of another crop or size than the darks become `elsewhere`.
+
         Raises:
-            ValueError: they differ in anything but exposures, kinds, frames and temperatures.
+            ValueError: they differ in anything but exposures, kinds, frames and temperatures, or darks do in size.
         """
-        if not stacks:
-            raise ValueError("join: expected at least one FrameStack, got none")
-        first = stacks[0]
-        for name in ("shape", "row_axis", "window", "cfa", "shutter", "black_level", "white_level", "iso"):
-            for other in stacks[1:]:
-                one, two = getattr(first, name), getattr(other, name)
-                if not np.array_equal(one, two):
-                    raise ValueError(f"join: the stacks differ in {name}: {one} and {two}")
-        changes = {
-            "counts": [counts for stack in stacks for counts in stack.counts],
-            "exposure_s": np.concatenate([stack.exposure_s for stack in stacks]),
-            "kind": [kind for stack in stacks for kind in stack.kind],
-            "photons_e": _concatenate([stack.photons_e for stack in stacks], stacks),
-            "temperature_c": _concatenate([stack.temperature_c for stack in stacks], stacks),
-        }
-        return FrameStack(**{**first._arguments(), **changes})
+        return joined(stacks)
 
     def _arguments(self) -> dict[str, Any]:
         arguments = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {**arguments, "cfa": transpose_cfa(self.cfa) if self.row_axis == 1 else self.cfa}
 
     def __repr__(self) -> str:
-        rows, columns = self.shape
-        black = "to be estimated" if self.black_level is None else f"{np.round(self.black_level, 3)} DN"
-        white = "unknown" if self.white_level is None else f"{self.white_level:g} DN"
-        lines = [
-            f"FrameStack: {sum(self.n_frames)} frames of {rows} rows x {columns} columns, "
-            f"{self.cfa}, {self.shutter} shutter" + ("" if self.iso is None else f", ISO {self.iso:g}"),
-            f"  black level {black}, white level {white}",
-        ]
-        for i, (kind, exposure, n) in enumerate(zip(self.kind, self.exposure_s, self.n_frames, strict=True)):
-            line = f"  {kind} {exposure:9.6g} s  {n} frame{'s' if n > 1 else ''}"
-            if self.photons_e is not None and np.isfinite(self.photons_e[i]):
-                line += f", {self.photons_e[i]:g} photoelectrons per pixel"
-            if self.temperature_c is not None and np.isfinite(self.temperature_c[i]):
-                line += f", {self.temperature_c[i]:.1f} degrees Celsius"
-            lines.append(line)
-        return "\n".join(lines)
+        return described(self)
 
 
-def _concatenate(values: list[np.ndarray | None], stacks: Sequence[FrameStack]) -> np.ndarray:
-    """Per-exposure values of several stacks in one array, NaN where unknown."""
-    pairs = zip(values, stacks, strict=True)
-    return np.concatenate([np.full(stack.n_exposures, np.nan) if v is None else v for v, stack in pairs])
-
-
-def check_frame(frame: np.ndarray, stack: FrameStack, *, exposure: int, frame_number: int) -> None:
-    """Check the values of one raw frame `[row, column]` of a stack, DN.
-
-    `FrameStack.frame` and `frames` do so for every lazy frame they read, the constructor for every frame in
-    memory.
-
-    Raises:
-        ValueError: values that are not finite, not integers, negative, all the same, or mostly at the white
-            level; the message names the file (or the exposure) and the frame.
-    """
-    check_values(frame, white_level=stack.white_level, name=frame_name(stack, exposure, frame_number))
-
-
-def frame_name(stack: FrameStack, exposure: int, number: int) -> str:
-    """A frame as error messages call it: its file, or its place in the stack."""
-    counts = stack.counts[exposure]
-    if isinstance(counts, LazyFrames):
-        return counts.names[number]
-    return f"counts: frame {number} of {stack.kind[exposure]} exposure {exposure} ({stack.exposure_s[exposure]:g} s)"
-
-
-def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
-    """Contiguous uint16, or int32 where the stored type is signed, floating or wider than 16 bits."""
-    dtype = np.uint16 if frame.dtype.kind == "u" and frame.dtype.itemsize <= 2 else np.int32
-    return np.ascontiguousarray(frame.T if row_axis == 1 else frame, dtype)
-
-
-@contextmanager
-def _while_reading(name: str) -> Iterator[None]:
-    """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`.
-
-    Other errors pass, those of whoever reads the chunks, say, with a note of where it was.
-    """
-    try:
-        yield
-    except Exception as error:
-        if type(error).__module__.partition(".")[0] != "distributed":  # which is imported only by those who use it
-            error.add_note(f"while {name}, or a frame after it, was read")
-            raise
-        raise RuntimeError(
-            f"{name}: the cluster was lost that this frame, or some after it, was read on ({type(error).__name__});"
-            " start it again, and run this once more"
-        ) from error
-
-
-def is_dask(counts: Any) -> bool:
-    return hasattr(counts, "__dask_graph__")
-
-
-def _checked(frame: np.ndarray, name: str, white_level: float | None, row_axis: int, function: Callable) -> Any:
-    check_values(frame, white_level=white_level, name=name)
-    return function(in_sensor_orientation(frame, row_axis))
+def _flats_elsewhere(elsewhere: Any, cfa: str) -> FrameStack | None:
+    if elsewhere is None:
+        return None
+    if not isinstance(elsewhere, FrameStack):
+        raise TypeError(f"elsewhere: expected a FrameStack of flats, got {type(elsewhere).__name__}")
+    if "dark" in elsewhere.kind or elsewhere.elsewhere is not None or elsewhere.channels != channels_of(cfa):
+        raise ValueError(
+            f"elsewhere: expected flats alone, with the channels {channels_of(cfa)}, got kinds {elsewhere.kind} and"
+            f" channels {elsewhere.channels}{' and more elsewhere' if elsewhere.elsewhere is not None else ''}"
+        )
+    return elsewhere
 
 
 def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hsnoise._frames import LazyFrames
-from hsnoise.stack import FrameStack, as_stack, check_frame
+from hsnoise._reading import check_frame
+from hsnoise.stack import FrameStack, as_stack
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hsnoise._frames import LazyFrames, shift_cfa, transpose_cfa
+from hsnoise._types import StatedGain
 from hsnoise.stack import FrameStack
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -114,6 +115,76 @@ def test_join_refuses_what_differs(name, value):
     one, two = FrameStack(dark_counts(2, 4, 4), 1.0), FrameStack(dark_counts(2, 4, 4), 2.0, **{name: value})
     with pytest.raises(ValueError, match=f"join: the stacks differ in {name}"):
         FrameStack.join(one, two)
+
+
+EGAIN = StatedGain(0.5, "EGAIN 2 e-/DN", certain=True)
+
+
+def known_darks():
+    return FrameStack(
+        dark_counts(2, 3, 8, 6), [0, 1], stated_gain=EGAIN, overscan_dn=[90, np.nan], assumed=["A dark is one"]
+    )
+
+
+def flats_of(rows, **keywords):
+    return FrameStack(dark_counts(4, rows, 6, mean=900), 0.5, kind="flat", **keywords)
+
+
+def test_what_loading_knows_is_kept():
+    stack = FrameStack.join(known_darks(), flats_of(10, assumed=["A flat is one"]))
+    part = stack.select(exposures=[1, 0], rows=(0, 4), frames=slice(2))
+    drawn = part.with_counts([dark_counts(2, 4, 6)] * 2, None)
+    for one in (stack, part, drawn):
+        assert one.stated_gain == EGAIN and one.assumed == ("A dark is one", "A flat is one")
+        assert one.elsewhere.shape == (10, 6) and one.elsewhere.n_frames == (4,)
+    np.testing.assert_array_equal(part.overscan_dn, [np.nan, 90])
+    np.testing.assert_array_equal(FrameStack.join(known_darks(), flats_of(8)).overscan_dn, [90, np.nan, np.nan])
+
+
+def test_flats_of_another_crop_lie_elsewhere():
+    darks, flats = known_darks(), flats_of(10)
+    for stack in (FrameStack.join(darks, flats), FrameStack.join(flats, darks)):
+        assert stack.kind == ("dark", "dark") and stack.shape == (8, 6)
+        np.testing.assert_array_equal(read_all(stack.elsewhere), read_all(flats))
+        assert stack.elsewhere.assumed == ()
+    assert "elsewhere on the sensor, 10 x 6 pixels:\n    flat       0.5 s  4 frames" in repr(stack)
+    twice = FrameStack.join(stack, flats_of(10))
+    assert twice.elsewhere.n_frames == (4, 4)
+    with pytest.raises(ValueError, match=r"differ in shape or window \(8 x 6 and 10 x 6 and 12 x 6\)"):
+        FrameStack.join(stack, flats_of(12))
+    with pytest.raises(ValueError, match="differ in shutter"):
+        FrameStack.join(darks, flats_of(10, shutter="global"))
+
+
+def test_flats_of_one_size_and_another_window_lie_elsewhere():
+    darks = known_darks().select(rows=(0, 8))
+    there = flats_of(8, window=(2, 0, 20, 6))
+    assert FrameStack.join(darks, there).elsewhere.window == (2, 0, 20, 6)
+
+
+def test_headers_that_contradict_each_other_state_no_gain():
+    other = flats_of(8, stated_gain=StatedGain(0.4, "EGAIN 2.5 e-/DN", certain=True))
+    stack = FrameStack.join(known_darks(), other)
+    assert stack.stated_gain is None and "EGAIN 2 e-/DN, EGAIN 2.5 e-/DN" in stack.assumed[-1]
+    assert FrameStack.join(known_darks(), flats_of(8, stated_gain=EGAIN)).stated_gain == EGAIN
+
+
+@pytest.mark.parametrize(
+    "changes, error, message",
+    [
+        ({"stated_gain": 0.5}, TypeError, "stated_gain: expected a StatedGain"),
+        ({"stated_gain": StatedGain(0.0, "EGAIN", True)}, ValueError, "stated_gain: expected a number > 0"),
+        ({"overscan_dn": [1, 2, 3]}, ValueError, "overscan_dn: expected 2"),
+        ({"elsewhere": 3}, TypeError, "elsewhere: expected a FrameStack"),
+        ({"elsewhere": "darks"}, ValueError, "elsewhere: expected flats alone"),
+        ({"assumed": "a sentence"}, TypeError, "assumed: expected a list"),
+        ({"assumed": [1]}, TypeError, "assumed: expected sentences"),
+    ],
+)
+def test_wrong_knowledge(changes, error, message):
+    given = {name: known_darks() if value == "darks" else value for name, value in changes.items()}
+    with pytest.raises(error, match=message):
+        FrameStack(dark_counts(2, 2, 8, 6), [0, 1], **given)
 
 
 def test_join_nothing():

@@ -37,6 +37,7 @@ class Classes:
             infinite where a class is clipped, too bright, or has too few pixels.
         pixels [class]: how many.
         hot [class]: whether beyond the growth of ordinary pixels.
+        limit_dn_per_s: growth from which on pixels are hot.
         pedestal_sigma_dn [exposure]: how well the common level of an exposure is known, from its frames.
         outlier_share [exposure]: of the pixels, set apart for an outlier.
     """
@@ -47,6 +48,7 @@ class Classes:
     error_dn2: np.ndarray
     pixels: np.ndarray
     hot: np.ndarray
+    limit_dn_per_s: float
     pedestal_sigma_dn: np.ndarray
     outlier_share: np.ndarray
 
@@ -101,7 +103,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         ]
         grown = [growth[1 - half] for half in measuring]
     else:
-        # Differences do not know of the mean of the same frames; ordinary pixels, whose growth is chance, are one class.
+        # Differences do not know of the mean of the same frames; ordinary pixels are one class.
         mean = growth.mean(0)
         peak = np.sqrt(pixels.whole_variance * (pixels.n_frames[:, None] - 1))
         members = _members(mean, _edges(mean, limit, False))
@@ -110,7 +112,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     level, variance, error, count, apart = (np.concatenate(x) for x in zip(*[p[:-1] for p in parts], strict=True))
     hot = np.concatenate([[g[m].mean() > limit for m in p[-1]] for g, p in zip(grown, parts, strict=True)])
     share = apart.sum(0) / max(count.sum(), 1)
-    return Classes(t, level, variance, error, count, hot.astype(bool), pixels.pedestal_sigma_dn, share)
+    return Classes(t, level, variance, error, count, hot.astype(bool), limit, pixels.pedestal_sigma_dn, share)
 
 
 def slope_over(exposure_s: np.ndarray, level: np.ndarray) -> np.ndarray:

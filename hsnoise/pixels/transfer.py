@@ -1,13 +1,13 @@
 """Pixel transfer: the gain from darks whose pixels differ, by the variance of single pixels over time.
 
-The mean level m and the temporal variance v of class c in exposure e obey
+The mean level m[c, e] and the temporal variance v[c, e] of class c in exposure e obey
 
-    v[c, e] = a[c] + K (m[c, e] - m[c, 0] - p[e]) + K (F - 1) x[c, e],
+    v[c, e] = a[c] + K (m[c, e] - m0[c] - p[e]) + K (F - 1) x[c, e],
 
-m[c, 0] standing for the level without signal, a[c] for the variance there, p[e] how far the pedestal of the exposure has moved, known as well
-as its frames agree, x[c, e] the signal of hot pixels beyond that of ordinary ones (0 for these), and F the Fano factor
-of hot pixels. A pedestal moves all classes alike, so pixels of different growth tell the gain whatever it does.
-Weighted least squares: the equation is linear in a, K, K p and K F.
+m0[c] being the level without signal, a[c] the variance there, p[e] how far the pedestal of the exposure has moved,
+known as well as its frames agree, x[c, e] the signal of hot pixels beyond that of ordinary ones (0 for these), and F
+the Fano factor of hot pixels. A pedestal moves all classes alike, so pixels of different growth tell the gain
+whatever it does. Weighted least squares: the equation is linear in a, K, K p and K F.
 
 Hot pixels fall below Poisson (F from 1 to 0.5: a generation centre emits a hole, then an electron). Half of the prior
 is that they do not, F = 1; the other half is spread evenly over 0.5 to 1: their word counts as far as ordinary pixels
@@ -39,7 +39,7 @@ class Transfer:
 
     Attributes:
         values, covariance: gain (DN/e-), variance without signal (DN^2, pixels' mean, with rounding), and mean
-            growth of all pixels (DN/s).
+            growth of ordinary pixels (DN/s).
         ordinary_gain, ordinary_error: DN/e-, from ordinary pixels alone.
         hot_gain, hot_error: K F from hot pixels alone, DN/e-; NaN without any.
         fano, fano_error: Fano factor of hot pixels, NaN without any.
@@ -199,7 +199,8 @@ def _told(classes: Classes, line: _Line, moved: np.ndarray) -> Transfer:
     turn[1, places.own(np.arange(len(share)))] = share / share.sum()
     turn[2, places.pedestal(exposures)] = -slopes / k
     turn[2, places.gain] = slopes @ shift / k
-    growth = float(classes.pixels / classes.pixels.sum() @ classes.growth_dn_per_s)
+    ordinary = classes.pixels * ~classes.hot
+    growth = float(ordinary / ordinary.sum() @ classes.growth_dn_per_s)
     values = np.array([k, turn[1] @ theta, growth - slopes @ shift])
     covariance, fano = turn @ line.covariance @ turn.T, (np.nan, np.nan)
     pair = np.ix_(*[[places.gain, places.hot_gain]] * 2)
