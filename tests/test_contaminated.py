@@ -1,7 +1,7 @@
 """Captures with something in them that is no dark signal of the sensor: the fit is right, or it says what is wrong.
 
 One row each: gain and read noise come within 3 standard errors or 2 % of the truth, or a sentence of `fit.doubts` names
-what is in the capture, or a ValueError does. An error of more than a twentieth of the value is no way to be within three.
+what is in the capture, or a ValueError does. An error of more than a twentieth of the value does not count as within 3.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ import pytest
 
 import hsnoise
 from benchmarks.pixel_simulator import Sensor, draw
-
-pytestmark = pytest.mark.skipif(not hasattr(hsnoise.FitResult, "doubts"), reason="the fit has no doubts yet")
 
 GAIN, READ_E, DARK_E_PER_S, BLACK_DN, WHITE_DN = 2.0, 2.5, 20.0, 64, 4095
 EXPOSURE_S = (0.05, 0.1, 0.2, 0.4)
@@ -172,7 +170,7 @@ def masterdark(capture: Capture, *_) -> None:
     counts[ODD] = np.rint(np.delete(counts, ODD, axis=0).mean(0))
 
 
-STUCK, FRAME = r"stuck|dead|never change|do not change|same value|constant", rf"frames?\b.*\b{ODD}\b"
+STUCK, FRAME = r"stuck|dead|never change|do not change|same value|constant", rf"[Ff]rames?\b.*\b{ODD}\b"
 ROWS = [
     *(("stuck at 0", stuck(0), share, rf"{STUCK}|clip") for share in SHARES),
     *(("stuck at white", stuck(WHITE_DN), share, rf"{STUCK}|saturat") for share in SHARES),
@@ -183,8 +181,8 @@ ROWS = [
     ("one lit frame", lit_frame, None, FRAME),
     ("one frame of another exposure", frame_of_another_exposure, None, FRAME),
     ("dead colour channel", dead_channel, None, r"[Cc]hannel R\b|\bred\b|\bR\b.*(stuck|dead|constant)"),
-    ("dead column", dead_column, None, r"[Cc]olumns? 101\b"),
-    ("dead row", dead_row, None, r"[Rr]ows? 77\b"),
+    ("dead column", dead_column, None, r"[Cc]olumns?\W*101\b"),
+    ("dead row", dead_row, None, r"[Rr]ows?\W*77\b"),
     *(("rows that repeat", rows_that_repeat, share, r"repeat|copies|identical|padd") for share in SHARES[1:]),
     ("two identical frames", identical_frames, None, rf"identical.*\b1\b.*\b{ODD}\b|\b1\b.*\b{ODD}\b.*identical"),
     ("a masterdark among darks", masterdark, None, FRAME),
