@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks._sheet import Sheet
 
+MEAN_DARK = "mean dark current"  # over all pixels, e-/s
 QUANTILE = 1.96  # of the normal law: intervals of 95 %
 
 
@@ -35,7 +36,7 @@ def figures(records: Sequence[dict]) -> dict[str, float]:
         "trustworthy": float(np.mean([record["trustworthy"] for record in records])),
         "seconds": float(np.median([record["seconds"] for record in records])),
     }
-    for name in ("gain", "read_noise.sigma", "dark_current.rate"):
+    for name in ("gain", "read_noise.sigma", MEAN_DARK):
         pulls = deviations(records, name)[:, 1]
         pulls = pulls[np.isfinite(pulls)]
         out[f"cover {name}"] = float((np.abs(pulls) < QUANTILE).mean()) if pulls.size else np.nan
@@ -59,7 +60,7 @@ def determined(records: dict[str, list[dict]]) -> Sheet:
             (
                 f"{kind} ({len(of_kind)})",
                 *(percent(f[name], "+.2f" if name == "bias" else ".2f") for name in ("bias", "rms", "worst")),
-                *(percent(f[f"cover {name}"]) for name in ("gain", "read_noise.sigma", "dark_current.rate")),
+                *(percent(f[f"cover {name}"]) for name in ("gain", "read_noise.sigma", MEAN_DARK)),
                 percent(f["withheld"]),
                 percent(f["trustworthy"]),
                 f"{f['seconds']:.1f} s",

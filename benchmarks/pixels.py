@@ -9,9 +9,9 @@ darks, five from which none does. Every finished fit is kept in `--out`, so that
 --real: captures of real sensors, as folders of files, from ../shared/data (or $HSNOISE_SHARED/data).
 
 Like is compared with like. The truth is that of the pixels that were drawn, not of the law they came from. The read
-noise is the rms over pixels, as `read_noise.sigma` is. The dark current is the mean over all pixels, hot ones included;
-if the fitted model has `hot_pixels`, whose charge comes on top of `dark_current.rate`, it is the mean without the hot
-centres.
+noise is the rms over pixels, as `read_noise.sigma` is. Where hot pixels begin, and whether a second group of pixels is
+one of them, is for each fit to say; its mean over all pixels is not. So the dark current here is that mean, hot pixels
+included: `dark_current.rate`, and `hot_pixels.fraction` times `hot_pixels.rate` where the fitted model has them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.progress import track
 
 import hsnoise
-from benchmarks._pixel_tables import determined, undetermined
+from benchmarks._pixel_tables import MEAN_DARK, determined, undetermined
 from benchmarks._real_folders import data_folder, real_sensors
 from benchmarks.pixel_simulator import DETERMINED, UNDETERMINED, draw
 
@@ -51,19 +51,33 @@ def one_fit(kind: str, seed: int, method: str) -> dict:
         "seconds": time.perf_counter() - began,
         "trustworthy": bool(fit.trustworthy),
         "doubts": list(fit.doubts),
-        "table": {name: [float(value), float(error)] for name, (value, error, _) in fit.table.items()},
-        "truth": truth_of(kind, drawn, hot_apart="hot_pixels" in fit.params.names),
+        "table": {name: [float(value), float(error)] for name, (value, error, _) in fit.table.items()}
+        | {MEAN_DARK: list(mean_dark_current(fit))},
+        "truth": truth_of(kind, drawn),
     }
 
 
-def truth_of(kind: str, drawn: dict, *, hot_apart: bool) -> dict[str, float]:
+def mean_dark_current(fit) -> tuple[float, float]:
+    """Mean over all pixels and its standard error, e-/s; hot pixels included where they are an effect of their own."""
+    slopes = {"dark_current.rate": 1.0}
+    value = fit.table["dark_current.rate"][0]
+    if "hot_pixels" in fit.params.names:
+        fraction, rate = (fit.table[f"hot_pixels.{name}"][0] for name in ("fraction", "rate"))
+        value += fraction * rate
+        slopes |= {"hot_pixels.fraction": rate, "hot_pixels.rate": fraction}
+    if np.isnan(value) or "dark_current.rate" not in fit.names:
+        return float(value), fit.table["dark_current.rate"][1]
+    slope = np.array([slopes.get(name, 0.0) for name in fit.names])
+    return float(value), float(np.sqrt(slope @ fit.covariance @ slope))
+
+
+def truth_of(kind: str, drawn: dict) -> dict[str, float]:
     """Parameter name to what is true of the pixels drawn; without those that are 0."""
     gains = KINDS[kind].gain_dn_per_e
     names = ["gain"] if len(gains) == 1 else ["gain.R", "gain.G", "gain.B"]
-    rate = drawn["ordinary_e_per_s"] + (0.0 if hot_apart else drawn["hot_e_per_s"])
     truth = dict(zip(names, gains, strict=True))
     truth["read_noise.sigma"] = float(np.sqrt((drawn["read_noise_e"] ** 2).mean()))
-    truth["dark_current.rate"] = float(rate.mean())
+    truth[MEAN_DARK] = float((drawn["ordinary_e_per_s"] + drawn["hot_e_per_s"]).mean())
     return {name: value for name, value in truth.items() if value > 0}
 
 

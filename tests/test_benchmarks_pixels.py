@@ -25,7 +25,7 @@ def test_figures_of_gains_are_relative_and_their_coverage_counted():
     f = figures([record(2.02, 0.02), record(1.98, 0.02), record(2.2, 0.05, trustworthy=False), record(np.nan, np.inf)])
     np.testing.assert_allclose([f["bias"], f["rms"], f["worst"]], [0.1 / 3, np.sqrt(0.0102 / 3), 0.1])
     np.testing.assert_allclose([f["cover gain"], f["withheld"], f["trustworthy"]], [2 / 3, 0.25, 0.75])
-    assert np.isnan(f["cover dark_current.rate"])
+    assert np.isnan(f["cover mean dark current"])
 
 
 def test_refused_and_nan_are_both_withheld():
@@ -36,18 +36,33 @@ def test_refused_and_nan_are_both_withheld():
     assert determined({"CCD warm": records}).rows[0][0] == "CCD warm (3)"
 
 
-def test_the_truth_of_the_dark_current_depends_on_whether_hot_pixels_are_apart(rng):
-    drawn = draw(pixels.KINDS["CCD warm"], rng)
-    apart, together = (pixels.truth_of("CCD warm", drawn, hot_apart=x)["dark_current.rate"] for x in (True, False))
-    assert apart == pytest.approx(0.3, rel=0.01)
-    assert together == pytest.approx(0.3 + 0.02 * 9, rel=0.1)
+def fitted(hot: bool):
+    """A fit with a gain of 0.7, a dark current of 0.3 and, with `hot`, 2 % hot pixels of 9 e-/s."""
+    values = {"gain": (0.7, 0.01), "dark_current.rate": (0.3, 0.003)}
+    if hot:
+        values |= {"hot_pixels.fraction": (0.02, 0.001), "hot_pixels.rate": (9.0, 0.2)}
+    return SimpleNamespace(
+        trustworthy=True,
+        doubts=(),
+        names=tuple(values),
+        covariance=np.diag([error**2 for _, error in values.values()]),
+        table={name: (*pair, "") for name, pair in values.items()},
+        params=SimpleNamespace(names=("dark_current", "hot_pixels") if hot else ("dark_current",)),
+    )
+
+
+def test_the_mean_dark_current_has_the_hot_pixels_in_it(rng):
+    assert pixels.mean_dark_current(fitted(False)) == (0.3, 0.003)
+    value, error = pixels.mean_dark_current(fitted(True))
+    assert value == pytest.approx(0.3 + 0.02 * 9)
+    assert error == pytest.approx(np.sqrt(0.003**2 + (9 * 0.001) ** 2 + (0.02 * 0.2) ** 2))
+    truth = pixels.truth_of("CCD warm", draw(pixels.KINDS["CCD warm"], rng))
+    assert truth["mean dark current"] == pytest.approx(0.3 + 0.02 * 9, rel=0.1)
 
 
 def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
-    fitted = SimpleNamespace(trustworthy=True, doubts=(), table={"gain": (0.7, 0.01, "DN/e-")}, params=None)
-    fitted.params = SimpleNamespace(names=("hot_pixels",))
     calls = []
-    monkeypatch.setattr(hsnoise, "fit", lambda *_, **keywords: calls.append(keywords) or fitted)
+    monkeypatch.setattr(hsnoise, "fit", lambda *_, **keywords: calls.append(keywords) or fitted(True))
     out = tmp_path / "pixels.jsonl"
     pixels.run(["CCD warm"], 1, 1, "auto", out)
     with out.open("a") as file:
