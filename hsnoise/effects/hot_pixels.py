@@ -26,7 +26,8 @@ class HotPixels(AbstractEffect):
     In dark frames: bright dots at fixed places that grow with exposure, each with its own shot noise, and of slow
     sensors fainter in bias frames, too.
 
-    Reference: Cox, *Renewal Theory*, 1962; Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE Trans. Nucl. Sci. 43, 1996.
+    References: Cox, *Renewal Theory*, 1962; Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE
+    Trans. Nucl. Sci. 43, 1996.
     """
 
     name: ClassVar[str] = "hot_pixels"
