@@ -119,8 +119,8 @@ def about_gain(gain: Gain | None, stated: StatedGain | None) -> list[str]:
     if gain.bright_dn_per_e < (1 - BENT) * gain.dn_per_e:
         fall = f"from {gain.dn_per_e:.3g} to {gain.bright_dn_per_e:.3g} DN/e-"
         said.append(
-            f"Variance over signal of the flats falls {fall} as they get brighter: the response bends, charge spreads, or"
-            " they saturate; dim flats tell the gain"
+            f"Variance over signal of the flats falls {fall} as they get brighter: the response bends, charge spreads,"
+            " or they saturate; dim flats tell the gain"
         )
     if stated is None:
         return said
