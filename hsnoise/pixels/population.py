@@ -23,6 +23,7 @@ SIGNIFICANT = 15.0  # twice the gain in log-likelihood from which pixels differ 
 LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
 MOST_HOT = 0.3
+FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames, too
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,8 @@ def population_of(
     steady = (apart < APART_SIGMAS * 2 * noise) | (apart < APART_SHARE * 2 * np.abs(growth))
     growth = growth[steady].astype(np.float64)
     values, errors = _fitted(growth, noise)
+    if not _hot_again(halves, limit - pedestal_dn_per_s):
+        values[2:], errors[2:] = 0.0, np.inf
     body, spread, fraction, rate = values
     # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
     cut = _mean_below(limit - pedestal_dn_per_s, noise, values)
@@ -85,6 +88,12 @@ def population_of(
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
     )
+
+
+def _hot_again(halves: np.ndarray, limit: float) -> bool:
+    """Whether pixels that are hot in one half of the frames are so in the other: jumps and hits are not."""
+    once = halves[0] > limit
+    return bool(once.sum() > FEWEST_HOT and np.mean(halves[1][once] > limit / 2) > HOT_AGAIN)
 
 
 def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:

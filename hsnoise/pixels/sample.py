@@ -9,6 +9,7 @@ import numpy as np
 MOST_PIXELS = 1 << 22  # of an exposure that are looked at one by one
 MOST_OF_ALL = 1 << 24  # of all exposures together
 MOST_COUNTS = 1 << 26  # pixels times frames of one exposure in memory
+MOST_OF_SPREAD = 100_000  # pixels that tell the width of a distribution
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from what lies within
 FAR_FRAME = 5.0  # deviations of the frames' offsets from which one of them is an outlier
 FEWEST_ROWS = 24  # that tell the offset of a column in a frame
@@ -37,6 +38,7 @@ class Halves:
         lowest, highest [pixel]: extreme counts of all frames, DN.
         frame_means_dn [frame]: level of each frame beside that of the typical one, DN.
         pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
+        frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
     """
 
     n_frames: tuple[int, int]
@@ -47,6 +49,7 @@ class Halves:
     highest: np.ndarray
     frame_means_dn: np.ndarray
     pair_variance_dn2: np.ndarray
+    frame_noise_dn: np.ndarray
 
 
 def halves_of(counts: np.ndarray) -> Halves:
@@ -60,7 +63,9 @@ def halves_of(counts: np.ndarray) -> Halves:
     parts = [_moments(flat[half::2], lost) for half in (0, 1)]
     level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
     whole = flat.var(0, ddof=1) / lost
-    return Halves((len(flat[::2]), len(flat[1::2])), level, variance, peak, lowest, highest, frame_means, whole)
+    noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
+    frames = len(flat[::2]), len(flat[1::2])
+    return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise)
 
 
 def _take_off_common(values: np.ndarray) -> np.ndarray:
@@ -95,7 +100,8 @@ def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
 
 def _core_spread(rest: np.ndarray) -> np.float32:
     """Half the distance of the 16 % and 84 % quantiles: hot pixels and cosmic rays hardly move it."""
-    low, high = np.quantile(rest[:: max(1, len(rest) // 256)], (0.1587, 0.8413))
+    thin = rest.ravel()[:: max(1, rest.size // MOST_OF_SPREAD)]
+    low, high = np.quantile(thin, (0.1587, 0.8413))
     return np.float32((high - low) / 2)
 
 

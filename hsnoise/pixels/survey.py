@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,22 @@ class Plane:
     halves: Halves | None
 
 
+class OddLines(NamedTuple):
+    """Lines of the first frame of a group that are no measurement: [line] numbers on the sensor."""
+
+    constant_rows: np.ndarray
+    constant_columns: np.ndarray
+    repeated_rows: np.ndarray
+
+    @staticmethod
+    def of(frame: np.ndarray, step: int) -> OddLines:
+        """Rows and columns of one count throughout, and rows that repeat the one before of the same colours."""
+        rows, columns = np.ptp(frame, axis=1) == 0, np.ptp(frame, axis=0) == 0
+        repeated = np.zeros(len(frame), bool)
+        repeated[step:] = (frame[step:] == frame[:-step]).all(1) & ~rows[step:]
+        return OddLines(*(np.flatnonzero(x) for x in (rows, columns, repeated)))
+
+
 @dataclass(frozen=True)
 class Group:
     """One exposure: how it was taken, shares of clipped and saturated counts [channel], and its planes."""
@@ -35,6 +52,7 @@ class Group:
     n_frames: int
     clipped_share: np.ndarray
     saturated_share: np.ndarray
+    odd_lines: OddLines
     planes: tuple[Plane, ...]
 
 
@@ -101,7 +119,8 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
     planes = tuple(
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
     )
-    group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, planes)
+    odd = OddLines.of(stack.frame(i, 0), step)
+    group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, odd, planes)
     return group, highest
 
 
