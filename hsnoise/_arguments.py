@@ -18,7 +18,7 @@ from hsnoise._types import StatedGain, Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
 MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
-MOSAIC_MEAN, MOSAIC_VARIANCE = 0.15, 0.04  # of a pixel's noise, of its variance: two taps of a mono CCD leave 0.09, 0.01
+MOSAIC_MEAN, MOSAIC_VARIANCE = 0.15, 0.04  # of a pixel's noise and variance: taps of a mono CCD leave 0.09, 0.01
 MOSAIC = (
     "read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it is one, give"
     " its Bayer order: cfa='RGGB', say"
