@@ -119,6 +119,14 @@ def test_darks_that_are_flats(rng):
     assert "light got in, or they are flats" in findings([darks(rng, 0), flats(rng, 3000, 8)], [0, 8])
 
 
+def test_a_camera_that_subtracts_its_dark_current(rng):
+    counts = []
+    for i, seconds in enumerate((0, 4, 8)):
+        one = darks(rng, seconds).astype(int)
+        counts.append((one - int(one.mean()) - i + 800).clip(0).astype(np.uint16))
+    assert "does the camera subtract dark current?" in findings(counts, [0, 4, 8])
+
+
 def test_clipping_and_scaled_counts(rng):
     clipped = np.maximum(darks(rng, 0).astype(int) - 196, 0).astype(np.uint16)
     assert "Counts at 0 (black is clipped)" in findings([clipped, darks(rng, 4)], [0, 4])

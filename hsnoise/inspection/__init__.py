@@ -14,7 +14,7 @@ from hsnoise.decomposition import COMPONENTS, Component
 from hsnoise.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.inspection._odd import odd_frames
-from hsnoise.inspection._verdict import judged
+from hsnoise.inspection._verdict import about_growth, judged
 from hsnoise.io import load
 from hsnoise.stack import FrameStack, as_stack
 
@@ -95,6 +95,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         *clipping(groups, stack.white_level is not None),
         *_coarse(groups),
         *_overscan(stack, facts),
+        *about_growth(main_budget),
         *about_gain(gain, stack.stated_gain),
     ]
     if is_mosaic:

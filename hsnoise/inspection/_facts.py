@@ -13,7 +13,6 @@ import numpy as np
 
 from hsnoise._arguments import looks_like_a_mosaic
 from hsnoise._frames import LazyFrames
-from hsnoise._reading import frame_name
 from hsnoise.io._overscan import Strip, find, without
 from hsnoise.stack import FrameStack
 
@@ -167,7 +166,7 @@ def _of_frame(frame: np.ndarray, stack: FrameStack, i: int, number: int, parts: 
     white = highest + 1 if stack.white_level is None else stack.white_level
     overscan = [strip.pixels(frame).mean() for strip in parts.strips]
     return {
-        "name": Path(frame_name(stack, i, number)).name,
+        "name": Path(counts.names[number]).name if isinstance(counts, LazyFrames) else f"frame {number}",
         "clipped_share": float(np.mean(lit == 0)),
         "saturated_share": float(np.mean(lit >= white)),
         "highest_dn": highest,

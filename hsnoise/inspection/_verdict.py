@@ -13,6 +13,8 @@ from hsnoise.inspection._gain import Gain
 
 MOSTLY_CLIPPED = 0.3  # share of pixels at 0
 CERTAIN, ROUGH = 0.1, 0.5  # relative errors of a gain
+BEYOND_DOUBT = 20.0  # standard errors of a growth
+RISES_DN = 0.2  # of the mean, from the shortest to the longest exposure
 HOTTER_DN, HOTTER = 5.0, 1.5  # by which hot pixels rise
 
 
@@ -50,17 +52,31 @@ def judged(
 
 
 def growth_error(budget: NoiseBudget | None) -> float:
-    """Relative standard error of the growth of the temporal variance of darks, the least of all colours; inf: none."""
+    """Relative standard error of the growth of the temporal variance of darks, the least of all colours; inf: none.
+
+    Growth without a rise of the mean counts only if it is beyond doubt: the camera may subtract its dark current.
+    """
     if budget is None:
         return float("inf")
+    least = BEYOND_DOUBT if not mean_rises(budget) else 0.0
     growths = [one for (_, name), one in budget.growth.items() if name == "temporal"]
-    means = {}
+    return min((error / slope for slope, error in growths if slope > least * error), default=float("inf"))
+
+
+def mean_rises(budget: NoiseBudget) -> bool:
+    """Whether the mean of the darks of any colour rises with exposure."""
+    means: dict[str, list[tuple[float, float]]] = {}
     for row in budget.rows:
         if row.kind == "dark" and row.n_frames > 1:
             means.setdefault(row.channel, []).append((row.exposure_s, row.mean_dn))
-    rises = any(max(of)[1] > min(of)[1] + 0.2 for of in means.values() if len(of) > 1)
-    errors = [error / slope for slope, error in growths if slope > 0]
-    return min(errors, default=float("inf")) if rises else float("inf")
+    return any(max(of)[1] > min(of)[1] + RISES_DN for of in means.values())
+
+
+def about_growth(budget: NoiseBudget | None) -> list[str]:
+    """Noise that grows with exposure under a mean that does not."""
+    if budget is None or mean_rises(budget) or growth_error(budget) > CERTAIN:
+        return []
+    return ["The noise of the darks grows with exposure, but not their mean: does the camera subtract dark current?"]
 
 
 def _against_a_fit(
@@ -121,6 +137,8 @@ def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> s
         return "Dark current: of hot pixels, which grow with exposure; most pixels hardly do"
     if relative >= ROUGH:
         return "Dark current: at most a bound; neither mean nor noise grow clearly with exposure"
+    if last.level_dn <= first.level_dn:
+        return "Dark current: what the camera does not subtract; the mean does not rise"
     rise = (last.level_dn - first.level_dn) / (last.exposure_s - first.exposure_s)
     return f"Dark current: yes; most pixels rise by about {rise:.2g} DN/s"
 
