@@ -129,8 +129,8 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
     for channel in pixel.channels:
         t: Transfer | None = channel.transfer
         of = "" if channel.name == "mono" else f" of {channel.name}"
-        if t is None or result.withheld:
-            continue
+        if t is None or result.withheld or pixel.flats is not None:
+            continue  # the gain does not come from there
         if t.chi2 > OFF_LINE * max(t.dof, 1):
             yield (
                 f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"

@@ -71,17 +71,18 @@ class Levels(NamedTuple):
 
 
 def levels_of(found: Survey, channel: int) -> Levels | None:
-    """The sampled pixels of one channel; None without two dark exposures of two frames."""
+    """The sampled pixels of one channel that are not stuck; None without two dark exposures of two frames."""
     groups = [g for g in found.darks if g.n_frames > 1]
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
     halves = [[p.halves for p in g.planes if p.channel == channel] for g in groups]
+    moving = ~found.stuck(channel)
     level, variance, peak = (
-        np.stack([np.concatenate([getattr(h, name) for h in of], 1) for of in halves])
+        np.stack([np.concatenate([getattr(h, name) for h in of], 1)[:, moving] for of in halves])
         for name in ("level_dn", "variance_dn2", "peak_dn")
     )
-    whole = np.stack([np.concatenate([h.pair_variance_dn2 for h in of]) for of in halves])
+    whole = np.stack([np.concatenate([h.pair_variance_dn2 for h in of])[moving] for of in halves])
     sigma = _pedestal_sigmas([np.mean([h.frame_means_dn for h in of], axis=0) for of in halves])
     return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
 
