@@ -53,7 +53,7 @@ One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` ele
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
 errors do not say: whether the model is right. {}"""
-LOOK = dict.fromkeys(("ml", "line"), "Look at the residuals in histograms.png, and run {}.")
+LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}.")
 LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
 
 
@@ -142,7 +142,7 @@ def _fit(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), load_capture(args.paths, args)
     stack.check()
-    console, out = Console(highlight=False), args.out
+    console, out = Console(highlight=False, soft_wrap=True), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
     fit = fit_with_progress(stack, args.method, model)
