@@ -16,7 +16,7 @@ from hsnoise._frames import LazyFrames
 from hsnoise.io._overscan import Strip, find, without
 from hsnoise.stack import FrameStack
 
-MOST_COUNTS = 1 << 25  # that are kept in memory
+MOST_COUNTS = 1 << 24  # that are kept in memory
 MOST_SAMPLED = 1 << 18  # pixels of a frame that tell its level and noise
 FEWEST_ROWS = 16  # of a frame that are kept, however many there are
 READERS = 2  # frames that are decoded at a time
