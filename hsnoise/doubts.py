@@ -106,7 +106,8 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     hot = [c.transfer for c in pixel.channels if c.transfer is not None and np.isfinite(c.transfer.hot_gain)]
     bounds = [t for t in hot if t.hot_gain > 3 * t.hot_error]
     if bounds:
-        low, high = min(t.hot_gain for t in bounds), 2 * max(t.hot_gain for t in bounds)
+        low = max(min(t.hot_gain - 2 * t.hot_error for t in bounds), 0.0)
+        high = 2 * max(t.hot_gain + 2 * t.hot_error for t in bounds)
         why = (
             "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
             f" lies between {low:.3g} and {high:.3g} DN/e-"
