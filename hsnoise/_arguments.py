@@ -17,7 +17,11 @@ from hsnoise._frames import LazyFrames
 from hsnoise._types import StatedGain, Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
-MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
+MOSAIC_SIGMA, MOSAIC_SIZE, LEAST_PIXELS, MOST_PIXELS = 6.0, 0.04, 1024, 1 << 20
+MOSAIC = (
+    "read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it is one, give"
+    " its Bayer order: cfa='RGGB', say"
+)
 MOST_SEED = 2**31  # those of single draws are counted from it
 
 
@@ -98,27 +102,35 @@ def counter(say: Callable[[str], Any], text: str) -> Callable[[], None]:
 
 
 def warn_of_a_mosaic(frame: np.ndarray) -> None:
-    """Warn if a frame [row, column], said to be mono, looks like a colour mosaic.
+    """Warn if a frame [row, column], said to be mono, looks like a colour mosaic."""
+    if looks_like_a_mosaic(frame):
+        warnings.warn(f"cfa: {MOSAIC}", stacklevel=4)
 
-    What the pixels of 2 x 2 blocks differ by beyond offsets of rows and of columns is 0 on a mono sensor, in the mean
-    and in the noise; gains of three colours leave both.
+
+def looks_like_a_mosaic(frame: np.ndarray) -> bool:
+    """Whether the pixels of 2 x 2 blocks of a frame [row, column] differ as those of a colour mosaic do.
+
+    What they differ by beyond offsets of rows and of columns is 0 on a mono sensor, in the mean and in the noise; gains
+    of three colours leave both. A little of it, however significant, is a pattern of the readout.
     """
     rows, columns = (size // 2 * 2 for size in frame.shape)
     if rows * columns < LEAST_PIXELS:
-        return
+        return False
     blocks_of_rows = frame[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)
     # Some of a large frame: as floats all of it would take many times its memory.
     pixels = blocks_of_rows[:: -(-rows * columns // MOST_PIXELS)].astype(float)
+    # Hot pixels would drown what all others have in common.
+    low, high = np.quantile(pixels, (0.001, 0.999))
+    pixels = np.clip(pixels, low, high)
     squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2
+    variance = max(float(squares.mean()), 1e-12)
     sign = np.array([[1, -1], [-1, 1]])[None, :, None, :]
-    blocks = [(sign * values).sum((1, 3)).ravel() for values in (pixels, squares)]
-    scores = [abs(one.mean()) / max(one.std() / np.sqrt(one.size), 1e-12) for one in blocks]
-    if max(scores) > MOSAIC_SIGMA:
-        warnings.warn(
-            "cfa: read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it"
-            " is one, give its Bayer order: cfa='RGGB', say",
-            stacklevel=4,
-        )
+    for values, size in ((pixels, np.sqrt(variance)), (squares, variance)):
+        block = (sign * values).sum((1, 3)).ravel()
+        mean, error = abs(float(block.mean())), max(float(block.std()) / np.sqrt(block.size), 1e-12)
+        if mean > MOSAIC_SIGMA * error and mean > MOSAIC_SIZE * 4 * size:
+            return True
+    return False
 
 
 def check_key(name: str, key: Any) -> None:

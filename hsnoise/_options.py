@@ -132,6 +132,12 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
         help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait (default: 0)",
     )
     group.add_argument("--roi", type=_roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
+    group.add_argument(
+        "--overscan",
+        type=_overscan,
+        metavar="auto|R0:R1,C0:C1",
+        help="take off rows or columns that see no light: auto, or which, with : for all (:,1024:1050)",
+    )
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
     group.add_argument("--flats-exposure", type=_numbers, metavar="S[,S...]", help="their exposure in seconds")
 
@@ -223,6 +229,17 @@ def _shape(text: str) -> tuple[int, int]:
     if len(words) != 2:
         raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS such as 480x640, got {text!r}")
     return _positive(words[0]), _positive(words[1])
+
+
+def _overscan(text: str) -> str | tuple[Any, Any]:
+    """auto, or spans of rows and columns, None for all."""
+    if text == "auto":
+        return text
+    try:
+        rows, columns = (None if one == ":" else tuple(map(int, one.split(":"))) for one in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected auto or R0:R1,C0:C1 such as :,1024:1050, got {text!r}") from None
+    return rows, columns
 
 
 def _roi(text: str) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
 from hsnoise.coordinates import coordinates_for, labels
+from hsnoise.doubts import carries_no_gain, checked, confirmed
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.flat_gain import judged
@@ -20,6 +21,10 @@ from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
 from hsnoise.physics import Physics, flat_gain_of, physics_of
+from hsnoise.pixel_fit import measure
+from hsnoise.pixel_result import POPULATION, result_of
+from hsnoise.pixels.structure import can_be_transferred, pixels_differ
+from hsnoise.pixels.survey import Survey, survey
 from hsnoise.profile import profile_errors
 from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import as_stack
@@ -27,8 +32,10 @@ from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
 
 OUTLIERS_FROM = 1e-4
+PROBE_PIXELS, PROBE_FRAMES = 1 << 21, 16  # of each exposure, that tell whether pixels differ
 SMALLEST = 8  # rows and columns; fewer tell nothing of rows
-METHODS = ("auto", "ml", "line")
+METHODS = ("auto", "ml", "line", "transfer")
+PIXELS = ("auto", "alike", "differ")
 BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
@@ -43,8 +50,20 @@ def without_likelihood(model: NoiseModel) -> tuple[str, ...]:
     return tuple(name for name in model.names if name not in WITH_LIKELIHOOD)
 
 
-def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progress=None, **keywords) -> FitResult:
+def fit(
+    stack,
+    *,
+    model: NoiseModel | None = None,
+    method: str = "auto",
+    pixels: str = "auto",
+    progress=None,
+    **keywords,
+) -> FitResult:
     """Estimate all parameters of the paper's noise model jointly.
+
+    Where single pixels differ in what they hold in the dark, as those of real sensors do, the fit is conditional on
+    the pixel (`hsnoise.pixel_fit`), and their population becomes effects of the model; else pixels of a row are pooled
+    in the exact likelihood. A test on the frames decides.
 
     Args:
         stack: FrameStack, a `Summary` of one, or with FrameStack's keywords (exposure_s, black_level, white_level, cfa,
@@ -53,9 +72,10 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
             not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
             together with all others (`hsnoise.synthetic`); their values are where the search starts.
-        method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "auto" is
-            "ml", and if that does not converge, "line", which the result then says. With effects beyond the paper's
-            it is that of the fit which the simulated statistics start from.
+        method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "transfer" pixel
+            transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", which the result then
+            says. With effects beyond the paper's it is that of the fit which the simulated statistics start from.
+        pixels: "alike" pools the pixels whatever they are, "differ" never does, "auto" tests it.
         progress: called with no argument after each frame that has been read.
 
     Returns:
@@ -70,16 +90,32 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    if pixels not in PIXELS:
+        raise ValueError(f"pixels: expected one of {', '.join(PIXELS)}, got {pixels!r}")
     if model is not None and not isinstance(model, NoiseModel):
         raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
-    extra = () if model is None else without_likelihood(model)
-    if extra:
-        return _with_effects(stack, model, extra, method, progress, keywords)
-    with_row_gain = model is None or _check_model(model)
     source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
+    if isinstance(source, Summary) and (method == "transfer" or pixels == "differ"):
+        raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")
     if model is not None:
         check_fits(model, source, "model")  # before the frames are read
+    extra = () if model is None else without_likelihood(model)
+    found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
+    differ = found is not None and _is_conditional(found, method, pixels)
+    if set(extra) - set(POPULATION if differ else ()):
+        return _with_effects(source, model, extra, method, pixels, progress)
     summary = source if isinstance(source, Summary) else _summary_of(source, progress)
+    if differ or found is not None and pixels == "auto" and carries_no_gain(found, summary, method):
+        return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), found)
+    result = _pooled(summary, model, method)
+    if found is None or method == "line":
+        return result
+    return checked(confirmed(replace(result, stack=source), found, summary, model), found)
+
+
+def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:
+    """The exact likelihood, or the line fit, of pixels that are all alike."""
+    with_row_gain = model is None or _check_model(model)
     with_clamp = model is not None and "black_clamp" in model
     if with_clamp:
         _check_clamp(summary, method)
@@ -123,19 +159,42 @@ def _with_outliers(start: Physics, share: np.ndarray) -> Physics:
     return eqx.tree_at(lambda p: p.outliers, start, np.clip(share, OUTLIERS_FROM, 0.2), is_leaf=lambda x: x is None)
 
 
-def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, progress, keywords) -> FitResult:
-    """A fit of the base effects by likelihood, then of all together by simulated statistics."""
+def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, pixels: str, progress) -> FitResult:
+    """A fit of the base effects, then of all together by simulated statistics."""
     if isinstance(stack, Summary):
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
-    stack = as_stack(stack, **keywords)
-    check_fits(model, stack, "model")
     part = part_of(stack)
     check_effects(model, part)
     bare = model
     for name in extra:
         bare = bare.remove(name)
-    base = fit(stack, model=bare, method=method, progress=progress)
+    base = fit(stack, model=bare, method=method, pixels=pixels, progress=progress)
     return fit_synthetic(base, part, model)
+
+
+def _surveyed(stack) -> Survey:
+    """A survey of the stack, or where it is large of a part: enough to tell whether pixels differ."""
+    stack.check()
+    rows, columns = stack.shape
+    frames = slice(0, PROBE_FRAMES)
+    if rows * columns <= PROBE_PIXELS:
+        return survey(stack if max(stack.n_frames) <= PROBE_FRAMES else stack.select(frames=frames))
+    kept = max(PROBE_PIXELS // columns // 4 * 4, 32)
+    first = max((rows - kept) // 8 * 4, 0)
+    return survey(stack.select(rows=(first, min(first + kept, rows)), frames=frames))
+
+
+def _all_of(stack, found: Survey) -> Survey:
+    """The survey of the whole stack, that of the part if that is all."""
+    whole = found.shape == stack.shape and max(stack.n_frames) <= PROBE_FRAMES
+    return found if whole else survey(stack)
+
+
+def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
+    """Whether the fit is conditional on the pixel."""
+    if method == "transfer" or pixels == "differ":
+        return True
+    return method != "line" and pixels == "auto" and pixels_differ(found) and can_be_transferred(found)
 
 
 def _summary_of(stack, progress) -> Summary:

@@ -162,15 +162,20 @@ def _usable(flats: FlatMoments, c: int, signal, read, read_error) -> tuple[np.nd
 
 def row_gain_variance(flats: FlatMoments, signal, c: int) -> float:
     """Variance of the gain of rows, which scales the variance within them; 0 if chance."""
+    mean, error = row_gain_of(flats, signal, c)
+    return mean if mean > 5 * error else 0.0
+
+
+def row_gain_of(flats: FlatMoments, signal, c: int) -> tuple[float, float]:
+    """Variance of the gain of rows from what the means of rows have in common, and its standard error."""
     lit = signal > 0
     if not lit.any():
-        return 0.0
+        return 0.0, np.inf
     chance = flats.variance_dn2[lit, c] / flats.row_pixels[lit, c]
     relative = (flats.row_power_dn2[lit, c] - chance) / signal[lit] ** 2
     error = flats.row_power_dn2[lit, c] * np.sqrt(2 / flats.row_dof[lit, c]) / signal[lit] ** 2
     w = 1 / np.maximum(error, 1e-30) ** 2
-    mean = float((w * relative).sum() / w.sum())
-    return mean if mean > 5 / np.sqrt(w.sum()) else 0.0
+    return float((w * relative).sum() / w.sum()), float(1 / np.sqrt(w.sum()))
 
 
 def _saturation(excess: np.ndarray) -> int:

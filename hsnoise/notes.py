@@ -28,6 +28,12 @@ def closing_notes(result: FitResult) -> tuple[str, ...]:
     return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
 
 
+def pixel_notes(result: FitResult) -> tuple[str, ...]:
+    """Sentences under the table of a fit that is conditional on the pixel: no histogram of pooled pixels is its own."""
+    circumstances = (note(result) for note in (_order_note, _warming_note, _light_note))
+    return (*parameter_notes(result), *chain.from_iterable(circumstances))
+
+
 def parameter_notes(result: FitResult) -> list[str]:
     """What the capture does not determine of the paper's effects."""
     return [note for name, row in result.table.items() if (note := _note(name, row, result))]
@@ -40,6 +46,8 @@ def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
 
 def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:
     value, error, unit = row
+    if np.isnan(value):  # withheld: the doubts say so
+        return None
     parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
     relative = error / max(abs(value), 1e-30)
     if parameter == "gain" and relative > UNDETERMINED:
@@ -206,7 +214,7 @@ def _light_note(result: FitResult) -> list[str]:
             f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
             f" {exposures.max():g} s: if they saw light, they are flats; pass kind='flat'."
         ]
-    if rate < LIGHT_E_PER_S:
+    if not rate >= LIGHT_E_PER_S:
         return []
     return [
         f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +17,14 @@ from hsnoise import rows
 from hsnoise._types import unit_in_words
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, binning, dark_laws, log_probability
+from hsnoise.pixels.maps import PixelMaps, pixel_maps
+from hsnoise.stack import FrameStack
 from hsnoise.statistics import Summary, without_counts
 
 TITLES = {
     "ml": "Joint maximum likelihood",
     "line": "Line fit",
+    "transfer": "Pixel transfer: each pixel over time, its own level no noise",
     "synthetic": "Base fit, corrected for added effects by simulated statistics",
 }
 
@@ -33,12 +38,18 @@ class FitResult:
     Attributes:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         names, covariance: fitted parameters and their covariance, in the units of `table`.
-        method: "ml", "line", or "synthetic" with effects beyond the paper's.
+        method: "ml", "line", "transfer" where pixels differ, or "synthetic" with effects beyond the paper's.
         outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
         summary: the row histograms and photon transfer that were fitted.
         physics: the same parameters as `hsnoise.physics` takes them.
+        doubts: sentences on what disagrees, and on what is withheld; printed above the table.
+        withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
+            DN then (gain 1 DN/e-), so that darks are still drawn with the right noise.
+        added: effects of `params` that the fit put in because the pixels differ.
+        transfer: what pixel transfer found, where pixels differ: `hsnoise.pixel_fit.PixelFit`; else None.
+        stack: the frames, for `pixels`.
     """
 
     params: NoiseModel
@@ -51,6 +62,27 @@ class FitResult:
     notes: tuple[str, ...]
     summary: Summary
     physics: Physics
+    doubts: tuple[str, ...] = ()
+    withheld: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    transfer: Any = None
+    stack: FrameStack | None = None
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
+        return self.converged and not self.doubts and not self.withheld
+
+    @cached_property
+    def pixels(self) -> PixelMaps:
+        """Maps of offset, dark current, noise and flags of each pixel; the frames are read once more.
+
+        Raises ValueError where a summary was fitted, which has no frames, or no dark exposure has two frames.
+        """
+        if self.stack is None:
+            raise ValueError("pixels: this fit has no frames, it was made from a Summary or from flats")
+        known = not any(name.startswith("gain") for name in self.withheld)
+        return pixel_maps(self.stack, np.asarray(self.physics.gain) if known else None)
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
@@ -59,6 +91,9 @@ class FitResult:
         fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
         rows_ = {}
         for name, (value, unit) in self.params.table().items():
+            if name in self.withheld:
+                rows_[name] = (float("nan"), float("inf"), unit)
+                continue
             error = float(fitted.get(name, np.inf if name == "dark_current.rate" else 0.0))
             rows_[name] = (value, error, unit)
         return rows_
@@ -70,6 +105,9 @@ class FitResult:
 
     def with_notes(self, notes: tuple[str, ...]) -> FitResult:
         return replace(self, notes=notes)
+
+    def with_doubts(self, doubts: tuple[str, ...]) -> FitResult:
+        return replace(self, doubts=doubts)
 
     def expected_histograms(self) -> tuple[np.ndarray, ...]:
         """Counts that the model expects in the bins of `summary.histograms`: for each channel [exposure, bin]."""
@@ -100,6 +138,8 @@ class FitResult:
             table.add_row(name, *rounded(value, error), unit_in_words(unit))
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(f"{title}: {darks}{flats}", highlight=False)
+        for doubt in self.doubts:
+            console.print(f"! {doubt}", highlight=False)
         console.print(table)
         console.print(f"{self.outcome}; {self.iterations} iterations", highlight=False)
         for note in self.notes:
@@ -134,6 +174,8 @@ def _expected(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law)
 
 def rounded(value: float, error: float) -> tuple[str, str]:
     """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
+    if np.isnan(value):
+        return "not determined", ""
     if not (np.isfinite(error) and error > 0):
         return f"{value:.5g}", "held" if error == 0 else "not determined"
     digits = max(1 if 0 < abs(value) < 10 else 0, 1 - int(np.floor(np.log10(error))))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._frames import LazyFrames
+from hsnoise._types import StatedGain
 
 UNKNOWN_ORDER = "unknown order"  # a colour mosaic whose Bayer order the file does not tell for sure
 
@@ -24,10 +25,19 @@ class Recording:
         path: the file.
         counts: DN, `[frame, row, column]`, lazy unless the format forbids it.
         exposure_s, iso, temperature_c: as `FrameStack` has them.
-        kind: "dark" or "flat".
+        kind: "dark", "flat", "bias" (a dark of 0 s unless the file says another exposure), "light", or another word
+            that the file has for it.
         cfa: "mono", a Bayer order or `UNKNOWN_ORDER`.
         black_level, white_level: DN; black one value or one a channel.
         shutter: "rolling" or "global".
+        is_open: whether light was let in, by the file.
+        binning: sensor pixels in one of the file's, (rows, columns).
+        gain_setting: the number that the camera calls its gain, whatever its unit.
+        stated_gain: the gain as electrons per DN, if the file states it.
+        filter_name: the colour filter in front of the sensor.
+        is_master: an average of several frames, or counts that are no integers.
+        overscan: header's section of overscan pixels, ((first row, end row), (first column, end column)).
+        taken: time of the exposure, ISO 8601.
     """
 
     path: Path
@@ -40,6 +50,23 @@ class Recording:
     shutter: str | None = None
     iso: float | None = None
     temperature_c: float | None = None
+    is_open: bool | None = None
+    binning: tuple[int, int] | None = None
+    gain_setting: float | None = None
+    stated_gain: StatedGain | None = None
+    filter_name: str | None = None
+    is_master: bool = False
+    overscan: tuple[tuple[int, int], tuple[int, int]] | None = None
+    taken: str | None = None
+
+    @property
+    def n_frames(self) -> int:
+        return int(self.counts.shape[0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(rows, columns) as stored."""
+        return self.counts.shape[1], self.counts.shape[2]
 
 
 @contextmanager

@@ -88,8 +88,11 @@ def test_dng_of_other_exposures_and_isos(tmp_path):
     assert stack.exposure_s.tolist() == [0.01, 0.1] and stack.n_frames == (2, 2)
     np.testing.assert_array_equal(read_all(stack, 0)[1], dark_counts(32, 48, seed=3))
     write_dng(tmp_path / "4.dng", dark_counts(32, 48), iso=1600)
+    stack = load(tmp_path)
+    assert stack.n_frames == (2, 2) and stack.iso == 800
+    assert "1 frame of ISO 1600 was set aside: the others have ISO 800" in stack.assumed
     with pytest.raises(ValueError, match="0.dng and .*4.dng differ in iso: 800.0 and 1600.0"):
-        load(tmp_path)
+        load([tmp_path / "0.dng", tmp_path / "4.dng"])
 
 
 def test_dng_without_exposure_names_the_file_and_the_keyword(tmp_path):
@@ -155,7 +158,7 @@ def test_fits_bayer_order(tmp_path):
 
 def test_fits_light_frames_need_a_kind(tmp_path):
     write_fits(tmp_path / "a.fits", dark_counts(2, 8, 10), EXPTIME=2, IMAGETYP="Light Frame")
-    with pytest.raises(ValueError, match="a.fits: expected kind 'dark' or 'flat', got 'light frame'; give kind="):
+    with pytest.raises(ValueError, match="no dark and no flat frames: 2 frames were set aside: light .*give kind="):
         load(tmp_path)
     assert load(tmp_path, kind="flat").kind == ("flat",)
 

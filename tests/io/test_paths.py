@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsnoise._frames import LazyFrames
-from hsnoise.io import _paths, load
+from hsnoise.io import load
+from hsnoise.io._files import paths_of
 from hsnoise.io._grouping import group_by_exposure
 from hsnoise.io._recording import Recording
 
@@ -57,7 +58,7 @@ def test_paths_that_lead_nowhere(tmp_path):
 def test_square_brackets_in_a_real_name(tmp_path):
     path = tmp_path / "dark[1].npy"
     np.save(path, dark_counts(2, 4, 4))
-    assert _paths(str(path)) == [path]
+    assert paths_of(str(path)) == ([path], [])
 
 
 @given(st.lists(st.tuples(st.sampled_from(["dark", "flat"]), st.floats(0, 100), st.floats(1, 1.0004)), min_size=1))

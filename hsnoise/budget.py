@@ -1,0 +1,278 @@
+"""The noise budget: what of a capture's counts is noise, of which kind, and how it grows with exposure."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise._arguments import callback
+from hsnoise.decomposition import COMPONENTS, Component
+from hsnoise.pixels.classes import growth_noise, levels_of, slope_over
+from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
+from hsnoise.pixels.survey import Group, Survey, survey
+from hsnoise.stack import as_stack
+
+HEADINGS = {"row_x_frame": "row x frame", "column_x_frame": "column x frame"}
+
+
+class TableRow(NamedTuple):
+    """One component of one exposure and colour; variances in DN^2, `share` of the sum of all components."""
+
+    exposure_s: float
+    kind: str
+    channel: str
+    component: str
+    variance_dn2: float
+    standard_error_dn2: float
+    share: float
+
+
+@dataclass(frozen=True)
+class BudgetRow:
+    """One exposure and colour: mean (DN), shares of clipped and saturated counts, and the components by name."""
+
+    exposure_s: float
+    kind: str
+    channel: str
+    n_frames: int
+    mean_dn: float
+    clipped_share: float
+    saturated_share: float
+    components: Mapping[str, Component]
+
+
+@dataclass(frozen=True)
+class PixelSpread:
+    """How one number differs between pixels: median, standard deviation of the core, 99.9 % quantile above the median.
+
+    The noise of its estimation is taken off `spread`; of `tail` it is a small part.
+    """
+
+    median: float
+    spread: float
+    tail: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class NoiseBudget:
+    """The three-dimensional noise decomposition of a stack; made by `hsnoise.budget`.
+
+    Attributes:
+        rows: one for each exposure and colour, in the order of the stack.
+        growth: (colour, component) to slope and standard error over the dark exposures, DN^2/s.
+        pixels: (colour, what) to how it differs between pixels: "offset", "dark signal", "temporal noise".
+        flags: colour to the share of pixels that are stuck, dead, hot, telegraph-like (NaN: not told).
+        survey: what the pass over the pixels kept.
+    """
+
+    rows: tuple[BudgetRow, ...]
+    growth: Mapping[tuple[str, str], tuple[float, float]]
+    pixels: Mapping[tuple[str, str], PixelSpread]
+    flags: Mapping[str, Mapping[str, float]]
+    survey: Survey = field(repr=False)
+
+    @property
+    def table(self) -> tuple[TableRow, ...]:
+        """All components as rows of numbers."""
+        return tuple(
+            TableRow(row.exposure_s, row.kind, row.channel, name, c.variance_dn2, c.standard_error_dn2, c.share)
+            for row in self.rows
+            for name, c in row.components.items()
+        )
+
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame (needs pandas: pip install pandas)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("NoiseBudget.to_pandas: needs pandas; pip install pandas") from error
+        return pandas.DataFrame(self.table, columns=TableRow._fields)
+
+    def plot(self, model: Any = None) -> Any:
+        """Stacked bars of the components on a log axis; with `model`, a NoiseModel, its own budget beside each."""
+        from hsnoise import plots  # brings matplotlib, which is slow to import
+
+        return plots.budget(self, model)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=132, color_system=None)
+        console.print("Noise budget: variances in DN² ± standard error, and their share", highlight=False)
+        console.print(self.as_table())
+        for sentence in self.sentences():
+            console.print(f"- {sentence}", highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+    def as_table(self) -> Table:
+        """The table of `print`, for rich."""
+        table = Table()
+        colours = len({row.channel for row in self.rows}) > 1
+        for heading in ("exposure", *(["colour"] if colours else []), "mean / DN"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for name in COMPONENTS:
+            table.add_column(HEADINGS.get(name, name), justify="right", no_wrap=True)
+        for row in self.rows:
+            lit = "flat " if row.kind == "flat" else ""
+            first = [f"{lit}{row.exposure_s:.4g} s", *([row.channel] if colours else []), f"{row.mean_dn:.5g}"]
+            table.add_row(*first, *(_cell(row.components[name]) for name in COMPONENTS))
+        return table
+
+    def sentences(self) -> list[str]:
+        """What the table does not show: clipping, pixels that differ, pixels that are no noise."""
+        said = []
+        for row in self.rows:
+            where = f"{row.kind} {row.exposure_s:g} s" + ("" if row.channel == "mono" else f", {row.channel}")
+            if row.clipped_share > 0:
+                said.append(f"{where}: {row.clipped_share:.2g} of the counts are 0 (clipped).")
+            if row.saturated_share > 0:
+                said.append(f"{where}: {row.saturated_share:.2g} of the counts are at the white level.")
+        for (channel, what), one in self.pixels.items():
+            of = what if channel == "mono" else f"{what}, {channel}"
+            said.append(
+                f"Pixels differ in {of}: median {one.median:.4g}, spread {one.spread:.3g}, 99.9 % of them below median"
+                f" + {one.tail:.3g} {one.unit}."
+            )
+        for channel, shares in self.flags.items():
+            listed = [f"{name} {100 * share:.2g} %" for name, share in shares.items() if share > 0]
+            if listed:
+                said.append(
+                    f"Pixels that are no noise{'' if channel == 'mono' else f', {channel}'}: {', '.join(listed)}."
+                )
+        return said
+
+
+def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
+    """Split the counts of each exposure and colour into the components of the three-dimensional noise decomposition.
+
+    One pass over the frames, one in memory at a time; what is told of single pixels comes from evenly spread rows of
+    sensors above 4 Mpixel.
+
+    Args:
+        stack: FrameStack, or with FrameStack's keywords an array [frame, row, column] or [exposure, frame, row,
+            column], or a list of arrays [frame, row, column].
+        progress: called with no argument after each frame.
+
+    Returns:
+        NoiseBudget: `print` it for the table; variances are unbiased and may be below 0 where there is none. Of an
+        exposure of one frame all are NaN: what stays and what changes cannot be told apart.
+
+    Raises:
+        TypeError, ValueError: whatever `FrameStack` refuses.
+
+    Reference: D'Agostino and Webb, SPIE 1488, 1991.
+    """
+    tick = callback("progress", progress)
+    stack = as_stack(stack, **keywords)
+    stack.check()
+    return budget_of(survey(stack, tick))
+
+
+def budget_of(found: Survey) -> NoiseBudget:
+    """The budget of a survey."""
+    rows = tuple(_row(found, group, c) for group in found.groups for c in range(len(found.channels)))
+    flags = {name: _told_flags(found, c) for c, name in enumerate(found.channels)}
+    pixels = {}
+    for c, name in enumerate(found.channels):
+        pixels.update({(name, what): one for what, one in _spreads(found, c).items()})
+    return NoiseBudget(rows, _growth(rows), pixels, flags, found)
+
+
+def _row(found: Survey, group: Group, channel: int) -> BudgetRow:
+    planes = [p for p in group.planes if p.channel == channel]
+    components = {name: _mean([p.components[name] for p in planes]) for name in COMPONENTS}
+    return BudgetRow(
+        exposure_s=group.exposure_s,
+        kind=group.kind,
+        channel=found.channels[channel],
+        n_frames=group.n_frames,
+        mean_dn=float(np.mean([p.frame_means_dn.mean() for p in planes])),
+        clipped_share=float(group.clipped_share[channel]),
+        saturated_share=float(group.saturated_share[channel]),
+        components=components,
+    )
+
+
+def _mean(parts: list[Component]) -> Component:
+    """The mean of a component over the planes of a colour."""
+    n = len(parts)
+    error = np.sqrt(sum(p.standard_error_dn2**2 for p in parts)) / n
+    return Component(sum(p.variance_dn2 for p in parts) / n, float(error), sum(p.share for p in parts) / n)
+
+
+def _growth(rows: tuple[BudgetRow, ...]) -> dict[tuple[str, str], tuple[float, float]]:
+    """Weighted straight lines of the components over the dark exposures."""
+    found = {}
+    for channel in dict.fromkeys(row.channel for row in rows):
+        dark = [row for row in rows if row.channel == channel and row.kind == "dark" and row.n_frames > 1]
+        t = np.array([row.exposure_s for row in dark])
+        if len(dark) < 2 or np.ptp(t) == 0:
+            continue
+        for name in COMPONENTS:
+            y = np.array([row.components[name].variance_dn2 for row in dark])
+            weight = 1 / np.maximum(np.array([row.components[name].standard_error_dn2 for row in dark]), 1e-12) ** 2
+            centred = t - weight @ t / weight.sum()
+            information = weight @ centred**2
+            found[channel, name] = float(weight * centred @ y / information), float(information**-0.5)
+    return found
+
+
+def _told_flags(found: Survey, channel: int) -> dict[str, float]:
+    shares = counts_of(flags_of(found, channel))
+    if not any(g.kind == "flat" and g.n_frames > 1 for g in found.groups):
+        shares["dead"] = float("nan")
+    if levels_of(found, channel) is None:
+        shares["hot"] = float("nan")
+    return {name: shares[name] for name in FLAGS}
+
+
+def _spreads(found: Survey, channel: int) -> dict[str, PixelSpread]:
+    """How offset, dark signal and temporal noise differ between the sampled pixels."""
+    darks = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    if not darks:
+        return {}
+    halves = [p.halves for p in darks[0].planes if p.channel == channel]
+    level = np.concatenate([h.level_dn for h in halves], 1)
+    spreads = {"offset": _spread(level, "DN")}
+    pixels = levels_of(found, channel)
+    if pixels is not None:
+        spreads["dark signal"] = _spread(slope_over(pixels.exposure_s, pixels.level), "DN/s")
+    if min(halves[0].n_frames) > 1:
+        noise = np.concatenate([h.variance_dn2 for h in halves], 1)
+        one = _spread(noise, "DN²")
+        sigma = np.sqrt(float(noise.mean(dtype=np.float64)))
+        tail = np.sqrt(max(one.median + one.tail, 0.0)) - np.sqrt(max(one.median, 0.0))
+        spreads["temporal noise"] = PixelSpread(sigma, one.spread / (2 * sigma) if sigma > 0 else 0.0, tail, "DN")
+    return spreads
+
+
+def _spread(values: np.ndarray, unit: str) -> PixelSpread:
+    """Of values in two halves of the frames [half, pixel]; their covariance is free of the noise of estimation."""
+    mean = values.mean(0, dtype=np.float64)
+    median = float(np.median(mean))
+    width = 5 * 1.4826 * float(np.median(np.abs(mean - median))) + 1e-12
+    a, b = np.clip(values.astype(np.float64), median - width, median + width)
+    covariance = float(((a - a.mean()) * (b - b.mean())).mean())
+    noise = growth_noise(values) if len(mean) else 0.0
+    tail = max(float(np.quantile(mean, 0.999)) - median, 0.0)
+    return PixelSpread(median, float(np.sqrt(max(covariance, 0.0))), float(max(tail**2 - noise**2, 0.0) ** 0.5), unit)
+
+
+def _cell(component: Component) -> str:
+    if not np.isfinite(component.variance_dn2):
+        return "-"
+    value, error = component.variance_dn2, component.standard_error_dn2
+    if value < 2 * error:
+        return f"< {max(value, 0) + 2 * error:.2g}"
+    return f"{value:.3g} ± {error:.1g} {_percent(component.share)}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:3.0f} %" if share >= 0.1 else f"{100 * share:3.1f} %" if share >= 5e-4 else "< 0.1 %"

@@ -1,0 +1,134 @@
+"""The three-dimensional noise decomposition: counts split over frames, rows, columns and their interactions.
+
+Counts of one colour plane are a sum of independent random effects,
+
+    y[f, r, c] = mean + F[f] + R[r] + C[c] + RF[f, r] + CF[f, c] + P[r, c] + e[f, r, c],
+
+whose variances follow without bias from the mean squares of an analysis of variance: each mean square expects the
+variance of its own effect and, divided by how many pixels were averaged, those of the finer ones, which are taken off.
+
+Reference: D'Agostino and Webb, "Three-dimensional analysis framework and measurement methodology for imaging system
+noise", SPIE 1488, 1991; expected mean squares: Searle, Casella, McCulloch, *Variance Components*, 1992.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+COMPONENTS = ("frame", "row", "column", "row_x_frame", "column_x_frame", "pixel", "temporal")
+STATIC = ("row", "column", "pixel")
+BLOCK_ROWS = 256  # rows that are float64 at a time
+
+
+@dataclass(frozen=True)
+class Component:
+    """Variance of one component and its standard error, DN^2 (NaN: these frames do not tell), and its share."""
+
+    variance_dn2: float
+    standard_error_dn2: float
+    share: float = float("nan")
+
+
+class PlaneSums:
+    """Sums of one colour plane over its frames, from which the decomposition follows; frames are added one by one.
+
+    Memory: one int32 a pixel, whatever the number of frames.
+    """
+
+    def __init__(self, shape: tuple[int, int]):
+        self.shape = shape
+        self.reference: int | None = None
+        self.pixel = np.zeros(shape, np.int32)
+        self.rows: list[np.ndarray] = []
+        self.columns: list[np.ndarray] = []
+        self.squares = 0.0
+
+    def add(self, plane: np.ndarray) -> None:
+        """Add one frame [row, column] of whole counts."""
+        if self.reference is None:
+            self.reference = int(np.median(plane[:: max(1, plane.shape[0] // 64)]))
+        rows, columns = np.empty(self.shape[0]), np.zeros(self.shape[1])
+        for start in range(0, self.shape[0], BLOCK_ROWS):
+            at = slice(start, start + BLOCK_ROWS)
+            block = plane[at].astype(np.int32) - np.int32(self.reference)
+            self.pixel[at] += block
+            values = block.astype(np.float64)
+            rows[at] = values.sum(1)
+            columns += values.sum(0)
+            self.squares += float(np.vdot(values, values))
+        self.rows.append(rows)
+        self.columns.append(columns)
+
+    @property
+    def n_frames(self) -> int:
+        return len(self.rows)
+
+    @property
+    def frame_means_dn(self) -> np.ndarray:
+        """Mean of each frame [frame], DN."""
+        return np.array([r.sum() for r in self.rows]) / (self.shape[0] * self.shape[1]) + self.reference
+
+    def mean_map_dn(self) -> np.ndarray:
+        """Mean of each pixel over the frames [row, column], DN, float32."""
+        return self.pixel.astype(np.float32) / np.float32(self.n_frames) + np.float32(self.reference)
+
+    def components(self) -> dict[str, Component]:
+        """The variances of all components; standard errors are those of normal noise."""
+        n, (h, w) = self.n_frames, self.shape
+        if n < 2 or min(h, w) < 2:
+            return dict.fromkeys(COMPONENTS, Component(np.nan, np.nan))
+        return _from_mean_squares(_sums_of_squares(self), n, h, w)
+
+
+def _sums_of_squares(sums: PlaneSums) -> dict[str, float]:
+    """Sum of squares of each effect; they add up to that of all counts about their mean."""
+    n, (h, w) = sums.n_frames, sums.shape
+    row_frame, column_frame = np.stack(sums.rows), np.stack(sums.columns)  # sums over columns; over rows
+    whole = row_frame.sum()
+    correction = whole**2 / (n * h * w)
+    frame = (row_frame.sum(1) ** 2).sum() / (h * w)
+    row, column = (row_frame.sum(0) ** 2).sum() / (n * w), (column_frame.sum(0) ** 2).sum() / (n * h)
+    of_row_frame, of_column_frame = (row_frame**2).sum() / w, (column_frame**2).sum() / h
+    pixel = sum(float((part.astype(np.float64) ** 2).sum()) for part in np.array_split(sums.pixel, h // 64 + 1)) / n
+    return {
+        "frame": frame - correction,
+        "row": row - correction,
+        "column": column - correction,
+        "row_x_frame": of_row_frame - row - frame + correction,
+        "column_x_frame": of_column_frame - column - frame + correction,
+        "pixel": pixel - row - column + correction,
+        "temporal": sums.squares - of_row_frame - of_column_frame - pixel + frame + row + column - correction,
+    }
+
+
+def _from_mean_squares(squares: dict[str, float], n: int, h: int, w: int) -> dict[str, Component]:
+    """Variance components by equating mean squares with their expectations."""
+    dof = {
+        "frame": n - 1,
+        "row": h - 1,
+        "column": w - 1,
+        "row_x_frame": (n - 1) * (h - 1),
+        "column_x_frame": (n - 1) * (w - 1),
+        "pixel": (h - 1) * (w - 1),
+        "temporal": (n - 1) * (h - 1) * (w - 1),
+    }
+    mean = {name: squares[name] / dof[name] for name in COMPONENTS}
+    # Which mean squares, with which sign, leave an effect's own variance, and how many counts one of it spans.
+    contrasts: dict[str, tuple[int, dict[str, int]]] = {
+        "temporal": (1, {"temporal": 1}),
+        "pixel": (n, {"pixel": 1, "temporal": -1}),
+        "row_x_frame": (w, {"row_x_frame": 1, "temporal": -1}),
+        "column_x_frame": (h, {"column_x_frame": 1, "temporal": -1}),
+        "row": (n * w, {"row": 1, "pixel": -1, "row_x_frame": -1, "temporal": 1}),
+        "column": (n * h, {"column": 1, "pixel": -1, "column_x_frame": -1, "temporal": 1}),
+        "frame": (h * w, {"frame": 1, "row_x_frame": -1, "column_x_frame": -1, "temporal": 1}),
+    }
+    found = {}
+    for name in COMPONENTS:
+        span, signs = contrasts[name]
+        variance = sum(sign * mean[other] for other, sign in signs.items()) / span
+        error = np.sqrt(sum(2 * mean[other] ** 2 / dof[other] for other in signs)) / span
+        found[name] = Component(float(variance), float(error))
+    return found

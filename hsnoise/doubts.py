@@ -1,0 +1,225 @@
+"""No number without a check: what of a fit disagrees with its frames, in sentences, and what is withheld.
+
+The noise budget under the fitted model is set beside the measured one; what headers and the user said (gain, black
+level, colours, white level) is tested against the frames; a gain that no growth of signal carries is withheld.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from hsnoise._arguments import MOSAIC, looks_like_a_mosaic
+from hsnoise.notes import pixel_notes
+from hsnoise.pixel_fit import PixelFit, measure
+from hsnoise.pixel_result import result_of
+from hsnoise.pixels.oddities import oddities_of
+from hsnoise.pixels.structure import can_be_transferred, static_of
+from hsnoise.pixels.survey import Survey
+from hsnoise.pixels.transfer import ROUNDING, Transfer
+from hsnoise.result import FitResult
+from hsnoise.statistics import Summary
+
+APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
+HEADER_SHARE = 0.08  # of a gain that a header states
+BLACK_SIGMAS, BLACK_DN = 5.0, 0.25
+OFF_LINE = 3.0  # chi2 per degree of freedom
+STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
+
+
+def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
+    """Whether darks of several exposures show no growth of signal, so that their likelihood can not tell the gain.
+
+    What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
+    without them.
+    """
+    if method == "line" or not (can_be_transferred(found) and _several(found)):
+        return False
+    pixel = measure(found, replace(summary, flats=None))
+    return not pixel.determined and not _grows(pixel)
+
+
+def confirmed(result: FitResult, found: Survey, summary: Summary, model) -> FitResult:
+    """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
+    if summary.flats is not None or not can_be_transferred(found) or not _several(found):
+        return result
+    pixel = measure(found, summary)
+    if not pixel.determined:
+        return result
+    if result.method == "line":
+        failed = "NOT CONVERGE" in result.outcome
+        return _instead(result.outcome, pixel, summary, model, result) if failed else result
+    gain, error = np.asarray(result.physics.gain), _gain_errors(result)
+    off = np.abs(gain - pixel.estimate[: len(gain)])
+    apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)
+    if not apart.any():
+        return result
+    why = f"THE LIKELIHOOD'S GAIN, {gain[apart][0]:.3g} DN/e-, DISAGREES WITH PIXELS OVER TIME"
+    return _instead(why, pixel, summary, model, result)
+
+
+def _several(found: Survey) -> bool:
+    return len({g.exposure_s for g in found.darks if g.n_frames > 1}) > 1
+
+
+def _gain_errors(result: FitResult) -> np.ndarray:
+    return np.array([row[1] for name, row in result.table.items() if name.split(".")[0] == "gain"])
+
+
+def _errors(pixel: PixelFit) -> np.ndarray:
+    return np.sqrt(np.diagonal(pixel.covariance))[: len(pixel.channels)]
+
+
+def _grows(pixel: PixelFit) -> bool:
+    """Whether variance or mean of some colour grows with exposure beyond chance."""
+    return any(c.values[2] > 3 * np.sqrt(c.covariance[2, 2]) for c in pixel.channels)
+
+
+def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResult) -> FitResult:
+    other = result_of(pixel, summary, model, result.stack)
+    return replace(other, outcome=f"{why.partition(';')[0]}; pixel transfer instead")
+
+
+def checked(result: FitResult, found: Survey) -> FitResult:
+    """The result with its doubts, and the notes of what it does not determine."""
+    doubts = tuple(
+        dict.fromkeys(
+            sentence
+            for check in (_withheld, _of_transfer, _of_pooling, _stated_gain, _black_level, _mosaic, _odd)
+            for sentence in check(result, found)
+        )
+    )
+    notes = pixel_notes(result) if result.method == "transfer" else result.notes
+    return replace(result, doubts=doubts, notes=notes)
+
+
+def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
+    """Which parameters are withheld, what is known instead, and which capture would determine them."""
+    if not result.withheld:
+        return
+    pixel: PixelFit = result.transfer
+    floor = float(np.mean([c.values[1] for c in pixel.channels]))
+    error = float(np.sqrt(np.mean([c.covariance[1, 1] for c in pixel.channels]) / len(pixel.channels)))
+    read_dn = np.sqrt(max(floor - ROUNDING, 0.0))
+    hot = [c.transfer for c in pixel.channels if c.transfer is not None and np.isfinite(c.transfer.hot_gain)]
+    bounds = [t for t in hot if t.hot_gain > 3 * t.hot_error]
+    if bounds:
+        low, high = min(t.hot_gain for t in bounds), 2 * max(t.hot_gain for t in bounds)
+        why = (
+            "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
+            f" lies between {low:.3g} and {high:.3g} DN/e-"
+        )
+    elif not _several(found):
+        why = "darks of one exposure show no growth of signal"
+    else:
+        why = "the dark signal of ordinary pixels does not grow with exposure by enough"
+    yield (
+        f"The gain is not determined: {why}. Read noise is {read_dn:.4g} ± {error / max(2 * read_dn, 1e-9):.2g} DN. Add"
+        " flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
+    )
+
+
+def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
+    """Where pixels leave the line, pedestals move, and flats and darks disagree."""
+    pixel = result.transfer
+    if pixel is None:
+        return
+    for channel in pixel.channels:
+        t: Transfer | None = channel.transfer
+        of = "" if channel.name == "mono" else f" of {channel.name}"
+        if t is None or result.withheld or pixel.flats is not None:
+            continue  # the gain does not come from there
+        if t.chi2 > OFF_LINE * max(t.dof, 1):
+            yield (
+                f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"
+                f" {t.dof:.0f} degrees of freedom): telegraph noise, a bent response, or charge that spreads."
+            )
+        if t.moved.any():
+            e = int(np.argmax(t.moved))
+            yield (
+                f"The pedestal{of} moved by {t.pedestal_dn[e]:+.2g} DN at {t.classes.exposure_s[e]:g} s, more than its"
+                " frames differ: the gain comes from the differences between pixels there."
+            )
+    if pixel.flats is not None:
+        yield from _flats_against_darks(pixel)
+
+
+def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
+    for c, channel in enumerate(pixel.channels):
+        t = channel.transfer
+        if t is None or not t.ordinary_error < 0.2 * abs(t.ordinary_gain):
+            continue
+        flat, error = pixel.flats.gain[c], pixel.flats.standard_error[c]
+        if abs(flat - t.gain) > max(APART_SIGMAS * np.hypot(error, t.gain_error), 2 * APART_SHARE * flat):
+            yield (
+                f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
+                " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
+            )
+
+
+def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
+    """Static structure that a fit by pooled histograms takes for noise."""
+    if result.method == "transfer":
+        return
+    worst = 0.0
+    for c in range(len(found.channels)):
+        for group in found.darks:
+            one = static_of(found, group, c)
+            if one is not None and one.variance_dn2 > APART_SIGMAS * one.error_dn2:
+                worst = max(worst, one.variance_dn2 / max(one.temporal_dn2, 1e-12))
+    known = {"dark_signal_nonuniformity", "dark_current_nonuniformity", "hot_pixels"} & set(result.params.names)
+    if worst > STATIC_SHARE and not known:
+        yield (
+            f"Pixels differ: what stays in them is up to {worst:.0%} of what changes, and this fit takes it for noise."
+            " Its gain, dark current and read noise may be off by as much; hsnoise improve tells what is missing."
+        )
+
+
+def _stated_gain(result: FitResult, found: Survey) -> Iterator[str]:
+    """A gain that the header states, against the fitted one."""
+    stated = None if result.stack is None else result.stack.stated_gain
+    if stated is None or any(name.startswith("gain") for name in result.withheld):
+        return
+    rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
+    value, error = float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
+    if abs(value / stated.value_dn_per_e - 1) > max(HEADER_SHARE, 3 * error / value):
+        kind = "is wrong, or nominal" if stated.certain else "is not the gain in e-/DN, or wrong"
+        yield (
+            f"The header says {stated.source}; the frames say {1 / value:.3g} ± {error / value**2:.2g} e-/DN"
+            f" ({value:.4g} DN/e-): the header's number {kind}."
+        )
+
+
+def _black_level(result: FitResult, found: Survey) -> Iterator[str]:
+    """A black level that was given, against the level of the darks without signal."""
+    given = result.summary.black_level_dn
+    if given is None or result.transfer is None and result.method != "ml" or not _several(found):
+        return
+    pixel = result.transfer if result.transfer is not None else measure(found, replace(result.summary, flats=None))
+    for c, channel in enumerate(pixel.channels):
+        level, error = channel.black_dn
+        clipped = max(g.clipped_share[c] for g in found.darks)
+        if clipped > 1e-4 or not np.isfinite(error):
+            continue
+        if abs(level - given[c]) > max(BLACK_SIGMAS * error, BLACK_DN):
+            of = "" if channel.name == "mono" else f" of {channel.name}"
+            yield (
+                f"The black level{of} was given as {given[c]:.4g} DN; the darks without signal lie at {level:.4g} ±"
+                f" {error:.2g} DN. Leave it out, and it is fitted."
+            )
+
+
+def _mosaic(result: FitResult, found: Survey) -> Iterator[str]:
+    """A colour sensor that was read as mono."""
+    stack = result.stack
+    if stack is None or stack.cfa != "mono" or "dark" not in stack.kind:
+        return
+    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
+    if looks_like_a_mosaic(stack.frame(max(darks, key=lambda i: stack.exposure_s[i]), 0)):
+        yield f"The frames are {MOSAIC}."
+
+
+def _odd(result: FitResult, found: Survey) -> Iterator[str]:
+    yield from oddities_of(found)

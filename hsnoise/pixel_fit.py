@@ -1,0 +1,214 @@
+"""A fit of darks whose pixels differ: gain by pixel transfer, the rest by the components that carry it.
+
+Everything is conditional on the pixel: what stays in a pixel is no noise. The gain comes from how a pixel's variance
+over time grows with its level, or from flats where there are any; read noise from the variance that is there without
+signal; row gain from the rows' own component; and the population of pixels becomes the effects that draw it. See
+docs/likelihood.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
+from hsnoise.flats import FlatMoments
+from hsnoise.pixels.classes import Levels, classes_of, levels_of
+from hsnoise.pixels.population import Population, population_of
+from hsnoise.pixels.structure import double_differences, plane_rows
+from hsnoise.pixels.survey import Survey
+from hsnoise.pixels.transfer import ROUNDING, Transfer, pixel_transfer
+from hsnoise.statistics import Summary
+
+DETERMINED = 0.35  # relative standard error up to which a gain is a number
+ROW_GAIN_THERE = 3.0
+ROUNDS = 30
+UNKNOWN = 1e6  # relative error of what is not known
+OUTLYING = 6.0  # deviations of a pixel's temporal variance that is no noise of it
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What the darks (and flats) say of one colour, in DN.
+
+    Attributes:
+        name; transfer, population: None where exposures do not differ.
+        values, covariance: gain (DN/e-), variance without signal (DN^2, rounding included), growth (DN/s); what is not
+            known has an error of UNKNOWN.
+        black_dn: level without signal and its error.
+        row_gain: variance of the gain of rows and its error.
+    """
+
+    name: str
+    transfer: Transfer | None
+    population: Population | None
+    values: np.ndarray
+    covariance: np.ndarray
+    black_dn: tuple[float, float]
+    row_gain: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PixelFit:
+    """The channels, the gain of the flats if there are any, and the joint estimate with its covariance.
+
+    estimate: gain [channel], read noise (e-), dark current (e-/s); `determined` [channel] whether its gain is.
+    """
+
+    channels: tuple[Channel, ...]
+    flats: FlatGain | None
+    estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    determined: bool = False
+
+
+def measure(found: Survey, summary: Summary) -> PixelFit:
+    """Pixel transfer, flats and population of all channels, and the joint estimate."""
+    channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
+    flats = None
+    if summary.flats is not None:
+        black = np.array([one.black_dn[0] for one in channels])
+        floor, error = (np.array([f(one) for one in channels]) for f in (_floor, _floor_error))
+        flats = flat_gain(summary.flats, black, floor, error)
+        channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
+    estimate, covariance = _joint(channels)
+    gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
+    known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
+    return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
+
+
+def _floor(one: Channel) -> float:
+    return float(one.values[1])
+
+
+def _floor_error(one: Channel) -> float:
+    return float(np.sqrt(one.covariance[1, 1]))
+
+
+def _channel(found: Survey, c: int, name: str) -> Channel:
+    pixels = levels_of(found, c)
+    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
+    (growth, growth_error), black = _growth_of_means(found, c)
+    floor, floor_error = _temporal(found, c)
+    values, population = np.array([1.0, floor, growth]), None
+    covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
+    if transfer is not None and pixels is not None:
+        values, covariance = transfer.values.copy(), transfer.covariance.copy()
+        population = _population(found, c, pixels, transfer)
+        values[2] = population.mean
+        if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
+            # Where ordinary pixels do not grow, hot ones give a bound only.
+            values[:2] = 1.0, floor
+            covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
+    return Channel(name, transfer, population, values, covariance, black, _row_gain(found, c, values[2]))
+
+
+def _temporal(found: Survey, c: int) -> tuple[float, float]:
+    """Temporal variance of the pixels at the shortest exposure, DN^2, outliers set apart, and its standard error."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return 0.0, UNKNOWN
+    group = min(groups, key=lambda g: g.exposure_s)
+    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.planes if p.channel == c]).astype(np.float64)
+    typical = float(np.median(variance)) + 1e-6
+    kept = variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (group.n_frames - 1))) ** 2]
+    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
+
+
+def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Growth of the median pixel with exposure, DN/s, and level without signal, DN, each with its standard error."""
+    darks = found.darks
+    t = np.array([g.exposure_s for g in darks])
+    level = np.array([np.mean([np.median(p.row_mean_dn) for p in g.planes if p.channel == c]) for g in darks])
+    frames = [np.mean([p.frame_means_dn for p in g.planes if p.channel == c], axis=0) for g in darks]
+    scatter = np.sqrt(np.mean([of.var(ddof=1) for of in frames if len(of) > 1] or [1.0]))
+    error = np.array([scatter / np.sqrt(len(of)) for of in frames])
+    if np.ptp(t) == 0:
+        mean_error = float(1 / np.sqrt((error**-2.0).sum()))
+        return (0.0, UNKNOWN), (float(level.mean()), mean_error if t.max() == 0 else UNKNOWN)
+    design = np.stack([np.ones_like(t), t], 1) / error[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    theta = covariance @ design.T @ (level / error)
+    left = (level - theta[0] - theta[1] * t) / error
+    covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
+    errors = np.sqrt(np.diagonal(covariance))
+    return (float(theta[1]), float(errors[1])), (float(theta[0]), float(errors[0]))
+
+
+def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
+    t = pixels.exposure_s
+    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
+    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    rows = len(found.sampled_rows) * plane_rows(found)
+    pattern = np.concatenate(
+        [double_differences(p.halves.level_dn, rows) for p in group.planes if p.channel == c], axis=1
+    )
+    shift = float(slopes @ transfer.pedestal_dn)
+    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, pattern)
+
+
+def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
+    """Variance of the gain of rows: how the variance of row means grows with the square of the signal; its error."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    signal = growth * np.array([g.exposure_s for g in groups])
+    parts = [[p.components["row_x_frame"] for p in g.planes if p.channel == c] for g in groups]
+    y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
+    error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts])
+    if len(groups) < 2 or np.ptp(signal) <= 0:
+        return 0.0, UNKNOWN
+    design = np.stack([np.ones_like(signal), signal**2], 1) / error[:, None]
+    covariance = np.linalg.pinv(design.T @ design)
+    theta = covariance @ design.T @ (y / error)
+    error_of_gain = float(np.sqrt(covariance[1, 1]))
+    return (float(theta[1]), error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
+
+
+def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
+    """The channel with the gain, and the gain of rows, that its flats give; those of its darks are left for a check."""
+    values, covariance = one.values.copy(), one.covariance.copy()
+    values[0] = flats.gain[c]
+    covariance[0], covariance[:, 0] = 0.0, 0.0
+    covariance[0, 0] = flats.standard_error[c] ** 2
+    rows = row_gain_of(moments, flats.signal_dn[:, c], c)
+    return replace(one, values=values, covariance=covariance, row_gain=rows)
+
+
+def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
+    """Gain [channel], read noise and dark current in electrons, which all colours share, by least squares."""
+    n = len(channels)
+    data = np.concatenate([_without_rows(one) for one in channels])
+    weight = np.zeros((3 * n, 3 * n))
+    for c, one in enumerate(channels):
+        weight[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] = np.linalg.inv(one.covariance + np.diag([0, 1e-12, 1e-24]))
+    known = [c for c in range(n) if channels[c].covariance[0, 0] < (UNKNOWN / 2) ** 2]
+    gain = np.array([one.values[0] if c in known else np.nan for c, one in enumerate(channels)])
+    gain = np.where(np.isnan(gain), np.nanmean(gain) if known else 1.0, gain)
+    floor = np.array([max(data[3 * c + 1], 1e-6) for c in range(n)])
+    theta = np.concatenate([gain, [float(np.sqrt(np.mean(floor / gain**2)))], [float(np.mean(data[2::3] / gain))]])
+    for _ in range(ROUNDS):
+        model, slopes = _expected(theta, n)
+        information = slopes.T @ weight @ slopes + np.diag(np.append(np.full(n, 1e-14), [1e-14, 1e-14]))
+        step = np.linalg.solve(information, slopes.T @ weight @ (data - model))
+        theta = theta + np.clip(step, -0.5 * np.abs(theta) - 1e-9, 0.5 * np.abs(theta) + 1e-9)
+    off = data - model
+    chi2 = float(off @ weight @ off) / max(2 * n - 2, 1) if n > 1 else 1.0
+    return theta, np.linalg.inv(information) * max(chi2, 1.0)
+
+
+def _without_rows(one: Channel) -> np.ndarray:
+    """Gain, variance without signal less rounding, growth; what the gain of rows adds to variances taken off."""
+    widened = 1 + (one.row_gain[0] if one.row_gain[0] > ROW_GAIN_THERE * one.row_gain[1] else 0.0)
+    return np.array([one.values[0] / widened, (one.values[1] - ROUNDING) / widened, one.values[2]])
+
+
+def _expected(theta: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gain, variance and growth of each channel, and their derivatives."""
+    gain, sigma, rate = theta[:n], theta[n], theta[n + 1]
+    model, slopes = np.empty(3 * n), np.zeros((3 * n, n + 2))
+    model[0::3], model[1::3], model[2::3] = gain, gain**2 * sigma**2, gain * rate
+    for c in range(n):
+        slopes[3 * c, c] = 1
+        slopes[3 * c + 1, [c, n]] = 2 * gain[c] * sigma**2, 2 * gain[c] ** 2 * sigma
+        slopes[3 * c + 2, [c, n + 1]] = rate, gain[c]
+    return model, slopes

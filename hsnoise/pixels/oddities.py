@@ -1,0 +1,91 @@
+"""Frames, lines and pixels of a capture that are no measurement of the sensor's noise, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hsnoise.pixels.flags import counts_of, flags_of
+from hsnoise.pixels.survey import Group, Survey
+
+ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by which its noise differs from the others'
+LEAST_LEVEL_DN = 0.5
+MANY = {"stuck": 5e-4, "telegraph": 5e-3}  # shares of pixels that are worth a sentence
+QUIET = 0.05  # of the other colours' noise: a colour that is dead
+FEWEST = 3  # frames, of which one can be told to be odd
+
+
+def oddities_of(found: Survey) -> tuple[str, ...]:
+    """What is wrong with frames, lines, pixels and colours, most important first."""
+    return (*_frames(found), *_lines(found), *_colours(found), *_pixels(found))
+
+
+def name_of(group: Group) -> str:
+    return f"{group.kind} frames of {group.exposure_s:g} s"
+
+
+def _frames(found: Survey) -> Iterator[str]:
+    for group in found.groups:
+        if group.n_frames < FEWEST:
+            continue
+        level = np.mean([p.halves.frame_means_dn for p in group.planes], axis=0)
+        noise = np.mean([p.halves.frame_noise_dn for p in group.planes], axis=0)
+        off = level - np.median(level)
+        scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
+        pixel = float(np.median(noise))
+        for f in np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
+            side = "brighter" if off[f] > 0 else "darker"
+            yield (
+                f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or of"
+                " another exposure or temperature? Leave it out."
+            )
+        for f in np.flatnonzero(noise < (1 - ODD_NOISE) * pixel):
+            yield (
+                f"Frame {f} of the {name_of(group)} has {1 - noise[f] / pixel:.0%} less noise than the others: is it an"
+                " average of frames (a masterdark)? Leave it out."
+            )
+
+
+def _lines(found: Survey) -> Iterator[str]:
+    for group in found.groups[:1]:
+        odd = group.odd_lines
+        for what, lines in (("rows", odd.constant_rows), ("columns", odd.constant_columns)):
+            if len(lines):
+                yield f"{_listed(what, lines)} have one count throughout: they are dead, or padding. Crop them (roi)."
+        if len(odd.repeated_rows):
+            yield f"{_listed('rows', odd.repeated_rows)} repeat the row before: they are padding. Crop them (roi)."
+
+
+def _listed(what: str, lines: np.ndarray) -> str:
+    shown = ", ".join(str(n) for n in lines[:5])
+    return f"{len(lines)} {what} ({shown}{', ...' if len(lines) > 5 else ''})"
+
+
+def _colours(found: Survey) -> Iterator[str]:
+    """Colours without noise."""
+    if len(found.channels) == 1:
+        return
+    for group in found.darks[:1]:
+        noise = [
+            np.mean([p.components["temporal"].variance_dn2 for p in group.planes if p.channel == c])
+            for c in range(len(found.channels))
+        ]
+        for c, name in enumerate(found.channels):
+            if noise[c] < QUIET**2 * np.nanmax(noise):
+                yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
+
+
+def _pixels(found: Survey) -> Iterator[str]:
+    for c, channel in enumerate(found.channels):
+        shares = counts_of(flags_of(found, c))
+        of = "" if channel == "mono" else f" of channel {channel}"
+        if shares["stuck"] > MANY["stuck"]:
+            yield f"{100 * shares['stuck']:.2g} % of the pixels{of} never change: they are stuck, and are no noise."
+        if shares["telegraph"] > MANY["telegraph"]:
+            yield (
+                f"{100 * shares['telegraph']:.2g} % of the pixels{of} are far noisier than others of their level"
+                " (telegraph-like)."
+            )
+        if shares["dead"] > MANY["stuck"]:
+            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly answer to light: they are dead."

@@ -1,0 +1,120 @@
+"""A part of the pixels in memory, all frames of one exposure, and what two halves of the frames say of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+MOST_PIXELS = 1 << 22  # of an exposure that are looked at one by one
+MOST_OF_ALL = 1 << 24  # of all exposures together
+MOST_COUNTS = 1 << 26  # pixels times frames of one exposure in memory
+MOST_OF_SPREAD = 100_000  # pixels that tell the width of a distribution
+CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from what lies within
+FAR_FRAME = 5.0  # deviations of the frames' offsets from which one of them is an outlier
+FEWEST_ROWS = 24  # that tell the offset of a column in a frame
+
+
+def sampled_rows(shape: tuple[int, int], cell: int, exposures: int, most_frames: int) -> np.ndarray:
+    """Numbers of the sensor rows that are looked at: all of a small frame, evenly spread (pairs) of a large one."""
+    most = min(MOST_PIXELS, MOST_OF_ALL // max(exposures, 1), MOST_COUNTS // max(most_frames, 1))
+    cells = shape[0] // cell
+    kept = max(1, min(cells, most // (cell * shape[1])))
+    first = cell * np.unique(np.linspace(0, cells - 1, kept).round().astype(int))
+    return (first[:, None] + np.arange(cell)).ravel()
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What two halves of the frames (even and odd ones) say of each pixel of one plane and exposure.
+
+    Offsets that a whole frame, or a row or column of it, has in common are taken off.
+
+    Attributes:
+        n_frames: of each half (2).
+        level_dn [half, pixel]: mean, DN.
+        variance_dn2 [half, pixel]: unbiased temporal variance, DN^2; NaN where a half has one frame.
+        peak_dn [half, pixel]: largest deviation from the mean, DN.
+        lowest, highest [pixel]: extreme counts of all frames, DN.
+        frame_means_dn [frame]: level of each frame beside that of the typical one, DN.
+        pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
+        frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
+    """
+
+    n_frames: tuple[int, int]
+    level_dn: np.ndarray
+    variance_dn2: np.ndarray
+    peak_dn: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+    frame_means_dn: np.ndarray
+    pair_variance_dn2: np.ndarray
+    frame_noise_dn: np.ndarray
+
+
+def halves_of(counts: np.ndarray) -> Halves:
+    """Halves of the counts [frame, row, column] of one plane, two frames at least."""
+    n = len(counts)
+    lowest, highest = counts.min(0).ravel(), counts.max(0).ravel()
+    values = counts.astype(np.float32)
+    frame_means = _take_off_common(values)
+    flat = values.reshape(n, -1)
+    lost = _share_left(values.shape)
+    parts = [_moments(flat[half::2], lost) for half in (0, 1)]
+    level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
+    whole = flat.var(0, ddof=1) / lost
+    noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
+    frames = len(flat[::2]), len(flat[1::2])
+    return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise)
+
+
+def _take_off_common(values: np.ndarray) -> np.ndarray:
+    """Take the offsets of frames, of rows and of columns in a frame off `values` in place; returns those of frames."""
+    mean = values.mean(0)
+    spread = _core_spread(values[0] - mean) + np.float32(1e-3)
+    offsets = np.empty(len(values))
+    for k, frame in enumerate(values):
+        rest = np.clip(frame - mean, -CORE_SIGMAS * spread * 4, CORE_SIGMAS * spread * 4)
+        offsets[k] = _clipped_mean(rest, spread)
+        rest = np.clip(rest - np.float32(offsets[k]), -CORE_SIGMAS * spread, CORE_SIGMAS * spread)
+        of_rows = rest.mean(1, keepdims=True)
+        frame -= np.float32(offsets[k]) + of_rows
+        if len(frame) >= FEWEST_ROWS:
+            frame -= (rest - of_rows).mean(0, keepdims=True)
+    values += np.float32(_typical(offsets))
+    return offsets - _typical(offsets)
+
+
+def _typical(offsets: np.ndarray) -> float:
+    """Mean of the frames' offsets, or their median where one frame is far from all others."""
+    middle = float(np.median(offsets))
+    spread = 1.4826 * float(np.median(np.abs(offsets - middle)))
+    return middle if np.abs(offsets - middle).max() > FAR_FRAME * spread else float(offsets.mean())
+
+
+def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
+    """Mean of what lies near the median."""
+    middle = np.float32(np.median(rest[:: max(1, len(rest) // 64)]))
+    return float(np.clip(rest, middle - CORE_SIGMAS * spread, middle + CORE_SIGMAS * spread).mean(dtype=np.float64))
+
+
+def _core_spread(rest: np.ndarray) -> np.float32:
+    """Half the distance of the 16 % and 84 % quantiles: hot pixels and cosmic rays hardly move it."""
+    thin = rest.ravel()[:: max(1, rest.size // MOST_OF_SPREAD)]
+    low, high = np.quantile(thin, (0.1587, 0.8413))
+    return np.float32((high - low) / 2)
+
+
+def _share_left(shape: tuple[int, ...]) -> np.float32:
+    """Of the temporal variance, what is left when the means of rows and columns of a frame have been taken off."""
+    _, rows, columns = shape
+    return np.float32((1 - 1 / columns) * (1 - 1 / rows if rows >= FEWEST_ROWS else 1.0))
+
+
+def _moments(flat: np.ndarray, lost: np.float32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    level = flat.mean(0)
+    off = flat - level
+    peak = np.abs(off).max(0)
+    if len(flat) < 2:
+        return level, np.full_like(level, np.nan), peak
+    return level, np.einsum("fp,fp->p", off, off) / np.float32(len(flat) - 1) / lost, peak

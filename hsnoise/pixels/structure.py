@@ -1,0 +1,93 @@
+"""Whether pixels differ: static structure of single pixels, beside rows, columns and smooth shading."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.pixels.survey import Group, Survey
+
+WINSOR_SIGMAS = 5.0
+SIGNIFICANT = 5.0  # standard errors
+SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
+STREAKS = 0.04  # variance of row means over that of pixels from which streaks rule the noise
+CLIPPED = 0.01  # share of clipped counts from which the moments of pixels over time are no longer those of the noise
+
+
+class Static(NamedTuple):
+    """Static variance of single pixels and its standard error, DN^2; temporal variance, DN^2."""
+
+    variance_dn2: float
+    error_dn2: float
+    temporal_dn2: float
+
+
+def static_of(found: Survey, group: Group, channel: int) -> Static | None:
+    """The static variance of the pixels of one channel in one exposure; None where halves of the frames do not tell."""
+    planes = [p for p in group.planes if p.channel == channel]
+    if group.n_frames < 2:
+        return None
+    products, temporal = [], []
+    for plane in planes:
+        pattern = double_differences(plane.halves.level_dn, len(found.sampled_rows) * plane_rows(found))
+        products.append(covariance_terms(pattern))
+        temporal.append(float(np.median(plane.halves.pair_variance_dn2)))
+    terms = np.concatenate(products)
+    noise = np.mean([p.components["temporal"].variance_dn2 for p in planes])
+    return Static(float(terms.mean()), float(terms.std() / np.sqrt(len(terms))), float(noise))
+
+
+def plane_rows(found: Survey) -> float:
+    """Rows of a plane for each sampled row of the sensor."""
+    return 1.0 if found.cfa == "mono" else 0.5
+
+
+def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
+    """What pixels of blocks of 2 x 2 differ by beyond rows and columns [half, block], with the variance of a pixel.
+
+    level [half, pixel]: of `rows` rows. Smooth shading, row and column patterns cancel.
+    """
+    maps = level.reshape(2, int(rows), -1)
+    height, width = (size // 2 * 2 for size in maps.shape[1:])
+    a, b = maps[:, 0:height:2, :width], maps[:, 1:height:2, :width]
+    block = (a - b)[..., 0::2] - (a - b)[..., 1::2]
+    return block.reshape(2, -1) / np.float32(2)
+
+
+def covariance_terms(pattern: np.ndarray) -> np.ndarray:
+    """Products of two halves [half, place], winsorised, whose mean is the variance of what both share."""
+    width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
+    a, b = np.clip(pattern, -width, width).astype(np.float64)
+    return (a - a.mean()) * (b - b.mean())
+
+
+def pixels_differ(found: Survey) -> bool:
+    """Whether static structure of single pixels is significant, and large beside what changes from frame to frame."""
+    for c in range(len(found.channels)):
+        for group in found.darks:
+            one = static_of(found, group, c)
+            if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
+                return True
+        pixels = levels_of(found, c)
+        if pixels is not None:
+            growth = slope_over(pixels.exposure_s, pixels.level)
+            if np.mean(growth.min(0) > hot_from(growth)) > MANY_HOT:
+                return True
+    return False
+
+
+def can_be_transferred(found: Survey) -> bool:
+    """Whether pixels over time show their noise: hardly clipped, and not ruled by streaks of rows."""
+    for group in found.darks:
+        if group.n_frames < 2:
+            continue
+        if group.clipped_share.max() > CLIPPED:
+            return False
+        for plane in group.planes:
+            streaks, noise = (plane.components[name].variance_dn2 for name in ("row_x_frame", "temporal"))
+            if streaks > STREAKS * noise:
+                return False
+    return True

@@ -1,0 +1,169 @@
+"""One pass over a stack: the noise decomposition of each exposure and colour, and halves of a part of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise._types import cfa_tile
+from hsnoise.decomposition import COMPONENTS, Component, PlaneSums
+from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
+from hsnoise.stack import FrameStack
+
+NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
+FEWEST_STILL = 4  # frames
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One colour plane of one exposure: its place in the colour pattern, components, means, and sampled pixels."""
+
+    channel: int
+    row_mean_dn: np.ndarray
+    column_mean_dn: np.ndarray
+    frame_means_dn: np.ndarray
+    row_frame_dn: np.ndarray
+    components: dict[str, Component]
+    halves: Halves | None
+
+
+class OddLines(NamedTuple):
+    """Lines of the first frame of a group that are no measurement: [line] numbers on the sensor."""
+
+    constant_rows: np.ndarray
+    constant_columns: np.ndarray
+    repeated_rows: np.ndarray
+
+    @staticmethod
+    def of(frame: np.ndarray, step: int) -> OddLines:
+        """Rows and columns of one count throughout, and rows that repeat the one before of the same colours."""
+        rows, columns = np.ptp(frame, axis=1) == 0, np.ptp(frame, axis=0) == 0
+        repeated = np.zeros(len(frame), bool)
+        repeated[step:] = (frame[step:] == frame[:-step]).all(1) & ~rows[step:]
+        return OddLines(*(np.flatnonzero(x) for x in (rows, columns, repeated)))
+
+
+@dataclass(frozen=True)
+class Group:
+    """One exposure: how it was taken, shares of clipped and saturated counts [channel], and its planes."""
+
+    exposure_s: float
+    kind: str
+    n_frames: int
+    clipped_share: np.ndarray
+    saturated_share: np.ndarray
+    odd_lines: OddLines
+    planes: tuple[Plane, ...]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What one pass over a stack keeps: its groups, which rows [row] the sampled pixels come from, and the shape."""
+
+    groups: tuple[Group, ...]
+    channels: tuple[str, ...]
+    cfa: str
+    sampled_rows: np.ndarray
+    shape: tuple[int, int]
+    full_scale_dn: float
+
+    def stuck(self, channel: int) -> np.ndarray:
+        """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
+        halves = [[p.halves for p in g.planes if p.channel == channel] for g in self.groups if g.n_frames > 1]
+        still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
+        noisy = [np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2 for of in halves]
+        frames = sum(sum(of[0].n_frames) for of, loud in zip(halves, noisy, strict=True) if loud)
+        if frames < FEWEST_STILL:  # few may agree by chance
+            return np.zeros(len(still[0]) if still else 0, bool)
+        return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
+
+    @property
+    def darks(self) -> tuple[Group, ...]:
+        return tuple(group for group in self.groups if group.kind == "dark")
+
+
+def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Survey:
+    """Read every frame of `stack` once; `tick` is called after each.
+
+    Raises ValueError for frames that cannot be measured, as `FrameStack.check_frame` does.
+    """
+    cell = len(cfa_tile(stack.cfa))
+    rows = sampled_rows(stack.shape, cell, stack.n_exposures, max(stack.n_frames))
+    highest = 0
+    groups = []
+    for i in range(stack.n_exposures):
+        group, top = _group(stack, i, rows, tick)
+        groups.append(group)
+        highest = max(highest, top)
+    full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
+    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full)
+
+
+def _full_scale(highest: int) -> float:
+    """The code at which counts end: that of a converter of 8, 10, 12, 14 bits if some reach it, else of 16 or more."""
+    if highest in (2**b - 1 for b in (8, 10, 12, 14)):
+        return float(highest)
+    return float(max(2**16 - 1, highest))
+
+
+def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object]) -> tuple[Group, int]:
+    tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
+    step, channels = len(tile), len(stack.channels)
+    sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
+    kept: np.ndarray | None = None
+    clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
+    for f, frame in enumerate(stack.frames(i)):
+        if kept is None:
+            kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
+        kept[f] = frame[rows]
+        white = np.inf if stack.white_level is None else stack.white_level
+        for p in range(step * step):
+            plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
+            sums[p].add(plane)
+            clipped[c] += np.count_nonzero(plane == 0)
+            saturated[c] += np.count_nonzero(plane >= white)
+            pixels[c] += plane.size
+        highest = max(highest, int(frame.max()))
+        tick()
+    assert kept is not None  # a group has a frame: FrameStack
+    planes = tuple(
+        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
+    )
+    odd = OddLines.of(stack.frame(i, 0), step)
+    group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, odd, planes)
+    return group, highest
+
+
+def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
+    n, (h, w) = sums.n_frames, sums.shape
+    halves = halves_of(counts) if n > 1 else None
+    row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
+    reference = float(sums.reference or 0)
+    return Plane(
+        channel=int(channel),
+        row_mean_dn=row_frame.mean(0) + reference,
+        column_mean_dn=column_frame.mean(0) + reference,
+        frame_means_dn=sums.frame_means_dn,
+        row_frame_dn=row_frame - row_frame.mean(0) - row_frame.mean(1, keepdims=True) + row_frame.mean(),
+        components=_with_tails(sums.components(), halves, h * w),
+        halves=halves,
+    )
+
+
+def _with_tails(found: dict[str, Component], halves: Halves | None, pixels: int) -> dict[str, Component]:
+    """Standard errors of what pixels carry from the pixels themselves: their noise differs, and has tails."""
+    if halves is None:
+        return found
+    level = halves.level_dn.mean(0, dtype=np.float64)
+    scatter = {"temporal": halves.pair_variance_dn2, "pixel": (level - level.mean()) ** 2}
+    for name, values in scatter.items():
+        error = float(values.std(dtype=np.float64)) / np.sqrt(pixels)
+        found[name] = Component(found[name].variance_dn2, max(error, found[name].standard_error_dn2))
+    total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
+    return {
+        name: Component(c.variance_dn2, c.standard_error_dn2, max(c.variance_dn2, 0.0) / total if total > 0 else np.nan)
+        for name, c in found.items()
+    }
