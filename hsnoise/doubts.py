@@ -17,7 +17,7 @@ from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
 from hsnoise.pixels.oddities import oddities_of
-from hsnoise.pixels.structure import can_be_transferred, static_of
+from hsnoise.pixels.structure import can_be_transferred, has_patterns, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
@@ -36,8 +36,10 @@ def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
     What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
     without them.
     """
-    if method == "line" or not (can_be_transferred(found) and _several(found)):
+    if method == "line" or not can_be_transferred(found):
         return False
+    if not _several(found):  # then flats do; a likelihood adds nothing, and rows and columns of a real sensor bend it
+        return summary.flats is not None and has_patterns(found)
     pixel = measure(found, replace(summary, flats=None))
     return not pixel.determined and not _grows(pixel)
 

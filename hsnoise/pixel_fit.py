@@ -8,6 +8,7 @@ docs/likelihood.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,12 +16,19 @@ import numpy as np
 from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
-from hsnoise.pixels.population import Population, population_of
+from hsnoise.pixels.population import Population, offset_sigma, population_of
 from hsnoise.pixels.structure import double_differences, plane_rows
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 from hsnoise.statistics import Summary
 
+PATTERNS = {
+    "frame": "frame_offset",
+    "row": "row_fixed_pattern",
+    "column": "column_fixed_pattern",
+    "row_x_frame": "row_noise",
+    "column_x_frame": "column_noise",
+}
 DETERMINED = 0.35  # relative standard error up to which a gain is a number
 ROW_GAIN_THERE = 3.0
 ROUNDS = 30
@@ -38,15 +46,20 @@ class Channel:
             known has an error of UNKNOWN.
         black_dn: level without signal and its error.
         row_gain: variance of the gain of rows and its error.
+        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its error.
+        temporal_dn2: variance of the pixels themselves.
     """
 
     name: str
     transfer: Transfer | None
     population: Population | None
+    offset_dn: tuple[float, float]
     values: np.ndarray
     covariance: np.ndarray
     black_dn: tuple[float, float]
     row_gain: tuple[float, float]
+    patterns: Mapping[str, tuple[float, float]]
+    temporal_dn2: float
 
 
 @dataclass(frozen=True)
@@ -92,7 +105,37 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             # Where ordinary pixels do not grow, hot ones give a bound only.
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
-    return Channel(name, transfer, population, values, covariance, black, _row_gain(found, c, values[2]))
+    rows, patterns = _row_gain(found, c, values[2]), _patterns(found, c)
+    offset = population.offset_sigma if population is not None else _offset(found, c)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor)
+
+
+def _offset(found: Survey, c: int) -> tuple[float, float]:
+    """Standard deviation of offsets where exposures do not tell them from dark current."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    return offset_sigma(_pattern(found, c), 0.0) if groups else (0.0, np.inf)
+
+
+def _pattern(found: Survey, c: int) -> np.ndarray:
+    """What pixels differ by at the shortest exposure, beside rows and columns [half, block]."""
+    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    rows = len(found.sampled_rows) * plane_rows(found)
+    parts = [double_differences(p.halves.level_dn, rows) for p in group.planes if p.channel == c]
+    return np.concatenate(parts, axis=1)
+
+
+def _patterns(found: Survey, c: int) -> dict[str, tuple[float, float]]:
+    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return {}
+    planes = [p for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == c]
+    out = {}
+    for component, effect in PATTERNS.items():
+        parts = [p.components[component] for p in planes]
+        error = np.sqrt(sum(one.standard_error_dn2**2 for one in parts)) / len(parts)
+        out[effect] = float(np.mean([one.variance_dn2 for one in parts])), float(error)
+    return out
 
 
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
@@ -146,11 +189,7 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
     t = pixels.exposure_s
     slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
-    rows = len(found.sampled_rows) * plane_rows(found)
-    pattern = np.concatenate(
-        [double_differences(p.halves.level_dn, rows) for p in group.planes if p.channel == c], axis=1
-    )
+    pattern = _pattern(found, c)
     shift = float(slopes @ transfer.pedestal_dn)
     return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, pattern)
 

@@ -100,7 +100,9 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         parts = [
             _measured(
                 _members(growth[1 - half], _edges(growth[1 - half], limit, True)),
-                *(x[:, half] for x in (pixels.level, pixels.variance, pixels.peak)),
+                pixels.level[:, half],
+                pixels.variance[:, half],
+                pixels.peak[:, half],
                 pixels.level[:, 1 - half],
                 t,
                 full_scale_dn,

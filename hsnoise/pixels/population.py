@@ -88,7 +88,7 @@ def population_of(
         hot_fraction=(fraction, errors[2]),
         hot_rate=(rate, errors[3]),
         at_readout=_at_readout(pixels, halves, noise, rate),
-        offset_sigma=_offset_sigma(pattern, spread * body * shortest),
+        offset_sigma=offset_sigma(pattern, spread * body * shortest),
         median=float(np.median(growth)),
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
@@ -192,7 +192,7 @@ def _errors(loss, theta: np.ndarray) -> np.ndarray:
     return np.sqrt(np.minimum(variance, 1e6))
 
 
-def _offset_sigma(pattern: np.ndarray, dark_sigma_dn: float) -> tuple[float, float]:
+def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float) -> tuple[float, float]:
     """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off."""
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
     a, b = np.clip(pattern, -width, width).astype(np.float64)

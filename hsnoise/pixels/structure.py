@@ -12,6 +12,7 @@ from hsnoise.pixels.survey import Group, Survey
 WINSOR_SIGMAS = 5.0
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
 STREAKS = 0.04  # variance of row means over that of pixels from which streaks rule the noise
 CLIPPED = 0.3  # share of clipped counts from which the moments of pixels over time say too little of the noise
@@ -73,6 +74,18 @@ def pixels_differ(found: Survey) -> bool:
                 return True
         if _always_bright(found, c) > MANY_HOT:
             return True
+    return False
+
+
+def has_patterns(found: Survey) -> bool:
+    """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    for plane in min(groups, key=lambda g: g.exposure_s).planes if groups else ():
+        noise = plane.components["temporal"].variance_dn2
+        for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
+            one = plane.components[name]
+            if one.variance_dn2 > max(SIGNIFICANT * one.standard_error_dn2, SMALL_PATTERN * noise):
+                return True
     return False
 
 
