@@ -17,7 +17,7 @@ from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.pixels.population import Population, offset_sigma, population_of
-from hsnoise.pixels.structure import double_differences, plane_rows
+from hsnoise.pixels.structure import double_differences, low_side_sigma, plane_rows
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 from hsnoise.statistics import Summary
@@ -113,15 +113,19 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
 def _offset(found: Survey, c: int) -> tuple[float, float]:
     """Standard deviation of offsets where exposures do not tell them from dark current."""
     groups = [g for g in found.darks if g.n_frames > 1]
-    return offset_sigma(_pattern(found, c), 0.0) if groups else (0.0, np.inf)
+    if not groups:
+        return 0.0, np.inf
+    pattern, low_side = _pattern(found, c)
+    return offset_sigma(pattern, 0.0, low_side)
 
 
-def _pattern(found: Survey, c: int) -> np.ndarray:
-    """What pixels differ by at the shortest exposure, beside rows and columns [half, block]."""
+def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
+    """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
     group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
     rows = len(found.sampled_rows) * plane_rows(found)
-    parts = [double_differences(p.halves.level_dn, rows) for p in group.planes if p.channel == c]
-    return np.concatenate(parts, axis=1)
+    levels = [p.halves.level_dn for p in group.planes if p.channel == c]
+    low_side = float(np.mean([low_side_sigma(one, rows) for one in levels]))
+    return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
 
 
 def _patterns(found: Survey, c: int) -> dict[str, tuple[float, float]]:
@@ -189,9 +193,8 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
     t = pixels.exposure_s
     slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    pattern = _pattern(found, c)
     shift = float(slopes @ transfer.pedestal_dn)
-    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, pattern)
+    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, *_pattern(found, c))
 
 
 def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:

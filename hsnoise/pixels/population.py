@@ -53,7 +53,7 @@ class Population:
 
 
 def population_of(
-    pixels: Levels, limit: float, ordinary: float, pedestal_dn_per_s: float, pattern: np.ndarray
+    pixels: Levels, limit: float, ordinary: float, pedestal_dn_per_s: float, pattern: np.ndarray, low_side_dn: float
 ) -> Population:
     """The population of one channel.
 
@@ -63,6 +63,7 @@ def population_of(
             taken off.
         pedestal_dn_per_s: what moving pedestals add to every pixel's growth.
         pattern [half, pixel]: offset of each pixel less its row and column, DN, at the shortest exposure.
+        low_side_dn: standard deviation of offsets as pixels below the median show it.
     """
     halves = slope_over(pixels.exposure_s, pixels.level) - pedestal_dn_per_s
     noise = growth_noise(halves) / np.sqrt(2)
@@ -88,7 +89,7 @@ def population_of(
         hot_fraction=(fraction, errors[2]),
         hot_rate=(rate, errors[3]),
         at_readout=_at_readout(pixels, halves, noise, rate),
-        offset_sigma=offset_sigma(pattern, spread * body * shortest),
+        offset_sigma=offset_sigma(pattern, spread * body * shortest, low_side_dn),
         median=float(np.median(growth)),
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
@@ -192,12 +193,16 @@ def _errors(loss, theta: np.ndarray) -> np.ndarray:
     return np.sqrt(np.minimum(variance, 1e6))
 
 
-def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float) -> tuple[float, float]:
-    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off."""
+def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
+    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off.
+
+    At most that of the pixels below the median: warm pixels are no normal offsets.
+    """
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
     a, b = np.clip(pattern, -width, width).astype(np.float64)
     product = (a - a.mean()) * (b - b.mean())
-    variance, error = float(product.mean()) - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
+    both = min(float(product.mean()), low_side_dn**2)
+    variance, error = both - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
     sigma = np.sqrt(max(variance, 0.0))
     return float(sigma), float(min(error / max(2 * sigma, 1e-12), np.sqrt(error)))
 

@@ -58,6 +58,21 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
     return block.reshape(2, -1) / np.float32(2)
 
 
+def low_side_sigma(level: np.ndarray, rows: float) -> float:
+    """Standard deviation of the offsets of pixels [half, pixel] as those below the median show it, DN.
+
+    Warm pixels stand above it only; row and column medians are taken off, the noise of estimation by the two halves.
+    """
+    maps = level.reshape(2, int(rows), -1).astype(np.float64)
+    mean = maps.mean(0)
+    mean = mean - np.median(mean, axis=0, keepdims=True)
+    mean = mean - np.median(mean, axis=1, keepdims=True)
+    apart = (maps[0] - maps[1]) / 2
+    low, middle = np.quantile(mean, (0.1587, 0.5))
+    low_noise, high_noise = np.quantile(apart, (0.1587, 0.8413))
+    return float(np.sqrt(max((middle - low) ** 2 - ((high_noise - low_noise) / 2) ** 2, 0.0)))
+
+
 def covariance_terms(pattern: np.ndarray) -> np.ndarray:
     """Products of two halves [half, place], winsorised, whose mean is the variance of what both share."""
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
