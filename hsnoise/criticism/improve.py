@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback, counter, seed_of
+from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
