@@ -37,9 +37,9 @@ from benchmarks._validation import psnr_db
 from hsnoise import NoiseModel
 from hsnoise._output import write_atomically
 from hsnoise._progress import busy
+from hsnoise.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import GREY, display_from_linear, light_of_frames
-from hsnoise.physics import ROUNDING_VARIANCE
 from hsnoise.weights import load_network, save_network
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")

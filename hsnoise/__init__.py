@@ -9,6 +9,7 @@ from hsnoise import cameras
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
 from hsnoise.fit import FitResult, fit
+from hsnoise.inspection import inspect
 from hsnoise.io import load
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel, sample, sample_dark
@@ -29,6 +30,7 @@ __all__ = [
     "diagnose",
     "fit",
     "improve",
+    "inspect",
     "load",
     "log_likelihood",
     "param",

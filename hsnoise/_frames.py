@@ -33,6 +33,7 @@ class LazyFrames:
         frame_shape: (rows, columns) that every frame must have.
         dtype: dtype of the stored counts.
         names: what to call each frame in an error, such as its file.
+        taken: time of each exposure, ISO 8601; None where unknown.
     """
 
     def __init__(
@@ -41,18 +42,20 @@ class LazyFrames:
         frame_shape: tuple[int, int],
         dtype: Any,
         names: Sequence[str] | None = None,
+        taken: Sequence[str | None] | None = None,
     ):
         self.readers = tuple(readers)
         self.shape = (len(self.readers), *frame_shape)
         self.dtype = np.dtype(dtype)
         self.names = tuple(names) if names else tuple(f"frame {i}" for i in range(len(self.readers)))
+        self.taken = tuple(taken) if taken else (None,) * len(self.readers)
 
     def __len__(self) -> int:
         return len(self.readers)
 
     def __getitem__(self, index: int | slice) -> Any:
         if isinstance(index, slice):
-            return LazyFrames(self.readers[index], self.shape[1:], self.dtype, self.names[index])
+            return LazyFrames(self.readers[index], self.shape[1:], self.dtype, self.names[index], self.taken[index])
         frame = np.asarray(self.readers[index]())
         if frame.shape != self.shape[1:]:
             raise ValueError(f"{self.names[index]}: read {frame.shape} pixels, expected {self.shape[1:]}")
@@ -70,7 +73,8 @@ def crop(counts: Any, rows: slice, columns: slice, *, frames: slice | None = Non
     indices = range(counts.shape[0])[chosen]
     readers = [partial(_read_region, counts, i, rows, columns) for i in indices]
     names = [counts.names[i] for i in indices] if isinstance(counts, LazyFrames) else None
-    return LazyFrames(readers, (rows.stop - rows.start, columns.stop - columns.start), counts.dtype, names)
+    taken = [counts.taken[i] for i in indices] if isinstance(counts, LazyFrames) else None
+    return LazyFrames(readers, (rows.stop - rows.start, columns.stop - columns.start), counts.dtype, names, taken)
 
 
 def _read_region(counts: Any, index: int, rows: slice, columns: slice) -> np.ndarray:

@@ -24,6 +24,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"hsnoise {version('hsnoise')}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _demo_arguments(commands)
+    _inspect_arguments(commands)
     _fit_arguments(commands)
     _loop_arguments(commands)
     _sample_arguments(commands)
@@ -46,6 +47,17 @@ def _demo_arguments(commands: Any) -> None:
     )
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
     _capture_arguments(demo)
+
+
+def _inspect_arguments(commands: Any) -> None:
+    text = (
+        "Look at a capture before any fit, in seconds: what its frames are, which are odd, their noise budget, what "
+        "can and what cannot be determined from them, and the next capture worth taking. Exits with 1 where a fit "
+        "makes no sense."
+    )
+    inspect = commands.add_parser("inspect", help="see what frames are and what they can tell", description=text)
+    inspect.add_argument("paths", nargs="+", metavar="PATH", help="a folder with bias, darks, flats; files; a pattern")
+    _capture_arguments(inspect)
 
 
 def _fit_arguments(commands: Any) -> None:
@@ -132,6 +144,12 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
         help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait (default: 0)",
     )
     group.add_argument("--roi", type=_roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
+    group.add_argument(
+        "--overscan",
+        type=_overscan,
+        metavar="auto|R0:R1,C0:C1",
+        help="take off rows or columns that see no light: auto, or which, with : for all (:,1024:1050)",
+    )
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
     group.add_argument("--flats-exposure", type=_numbers, metavar="S[,S...]", help="their exposure in seconds")
 
@@ -223,6 +241,17 @@ def _shape(text: str) -> tuple[int, int]:
     if len(words) != 2:
         raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS such as 480x640, got {text!r}")
     return _positive(words[0]), _positive(words[1])
+
+
+def _overscan(text: str) -> str | tuple[Any, Any]:
+    """auto, or spans of rows and columns, None for all."""
+    if text == "auto":
+        return text
+    try:
+        rows, columns = (None if one == ":" else tuple(map(int, one.split(":"))) for one in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected auto or R0:R1,C0:C1 such as :,1024:1050, got {text!r}") from None
+    return rows, columns
 
 
 def _roi(text: str) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -30,13 +30,14 @@ STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for nois
 
 
 def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
-    """Whether darks of several exposures show no growth of signal, so that no likelihood can tell the gain.
+    """Whether darks of several exposures show no growth of signal, so that their likelihood can not tell the gain.
 
-    What it would read it from is the shape of the distribution, which real pixels have for other reasons.
+    What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
+    without them.
     """
-    if method == "line" or summary.flats is not None or not (can_be_transferred(found) and _several(found)):
+    if method == "line" or not (can_be_transferred(found) and _several(found)):
         return False
-    pixel = measure(found, summary)
+    pixel = measure(found, replace(summary, flats=None))
     return not pixel.determined and not _grows(pixel)
 
 
@@ -128,8 +129,8 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
     for channel in pixel.channels:
         t: Transfer | None = channel.transfer
         of = "" if channel.name == "mono" else f" of {channel.name}"
-        if t is None or result.withheld:
-            continue
+        if t is None or result.withheld or pixel.flats is not None:
+            continue  # the gain does not come from there
         if t.chi2 > OFF_LINE * max(t.dof, 1):
             yield (
                 f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"

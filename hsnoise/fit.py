@@ -14,12 +14,13 @@ from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.doubts import carries_no_gain, checked, confirmed
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise.flat_gain import judged
 from hsnoise.line import line_fit
 from hsnoise.maximise import maximise
 from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
-from hsnoise.physics import Physics, physics_of
+from hsnoise.physics import Physics, flat_gain_of, physics_of
 from hsnoise.pixel_fit import measure
 from hsnoise.pixel_result import POPULATION, result_of
 from hsnoise.pixels.structure import can_be_transferred, pixels_differ
@@ -124,6 +125,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         )
     with jax.enable_x64(True):
         start = start_physics(summary, with_row_gain, with_clamp)
+        summary = _with_judged_flats(summary, start)
         if model is not None and "dark_current" not in model:
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
         if method == "line":
@@ -141,6 +143,13 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         if method == "ml" or with_clamp:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+
+
+def _with_judged_flats(summary: Summary, start: Physics) -> Summary:
+    """The curve of the flats' variance and what each level weighs come before the likelihood, which is given both."""
+    if summary.flats is None:
+        return summary
+    return replace(summary, flats=judged(summary.flats, flat_gain_of(start, summary.flats)))
 
 
 def _with_outliers(start: Physics, share: np.ndarray) -> Physics:

@@ -16,6 +16,7 @@ levels up to 70 % of saturation weighted by their signal, and its error is what 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,8 @@ LEAST_RANGE = 0.5  # of the range of signals that levels must span after the hig
 FEWEST_LEVELS = 4  # likewise
 LINE_RANGE = 0.7  # of saturation: EMVA 1288, release 4, section 6.6
 NARROW_DN2 = 0.25  # of variance, rounding included: below, rounding depends on where the mean lies between counts
-PAST_PEAK = 0.05  # the variance falls by more than this: saturation
+LOW = 0.25  # of the highest signal: a level below shows where the curve begins
+PAST_PEAK, STEEP = 0.05, 0.1  # the variance falls by more than this: from its highest value, anywhere: saturation
 LEAST_SIGMAS = 3.0  # by which a level's variance must exceed that of the darks
 
 
@@ -60,6 +62,9 @@ class FlatGain(NamedTuple):
     weight: np.ndarray
 
 
+OF_LEVELS = ("used", "level_gain", "level_error", "signal_dn", "weight")  # [level, channel]
+
+
 class _Levels(NamedTuple):
     """One channel, sorted by signal: signal, variance above that of the darks and its chance error; all [level]."""
 
@@ -86,31 +91,39 @@ class _Curve(NamedTuple):
         return self.chi2 <= ADEQUATE * max(self.dof, 1)
 
 
-def flat_gain(flats, black_dn, read_variance_dn2, read_variance_error_dn2=0.0) -> FlatGain:
+def flat_gain(flats, black_dn=None, read_variance_dn2=None, read_variance_error_dn2=0.0) -> FlatGain:
     """Gain from the photon transfer of flats.
 
     Args:
         flats: FlatMoments, or a Summary that holds them.
-        black_dn: mean count without light, [channel], or [level, channel] of darks of the levels' own exposures.
-        read_variance_dn2: temporal variance of those darks within rows as measured, rounding included; same shapes.
-        read_variance_error_dn2: its standard error.
+        black_dn: mean count without light, [channel], or [level, channel] of darks of the levels' own exposures; None:
+            as `flats` measured it on darks.
+        read_variance_dn2: temporal variance of those darks as measured, rounding included; same shapes; None likewise.
+        read_variance_error_dn2: its standard error, where it is given.
 
-    Raises:
-        ValueError: no level of light is above the noise of the darks.
+    Gain NaN and error infinite where no level has a variance above that of the darks, or nothing is known of darks.
     """
     flats = flats if isinstance(flats, FlatMoments) else flats.flats
     shape = flats.mean_dn.shape
+    black_dn = flats.dark_dn if black_dn is None else black_dn
+    if read_variance_dn2 is None:
+        read_variance_dn2, read_variance_error_dn2 = flats.dark_variance_dn2, flats.dark_error_dn2
     black, read, read_error = (
         np.broadcast_to(x, shape) for x in (black_dn, read_variance_dn2, read_variance_error_dn2)
     )
     channels = [_of_channel(flats, c, black[:, c], read[:, c], read_error[:, c]) for c in range(shape[1])]
-    return FlatGain(*(np.stack(x, axis=-1 if np.shape(x[0]) == shape[:1] else 0) for x in zip(*channels, strict=True)))
+    columns = dict(zip(FlatGain._fields, zip(*channels, strict=True), strict=True))
+    return FlatGain(**{name: np.stack(x, axis=-1 if name in OF_LEVELS else 0) for name, x in columns.items()})
 
 
 def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
     """The fields of FlatGain for one channel."""
     signal = flats.mean_dn[:, c] - black
     order, levels = _usable(flats, c, signal, read, read_error)
+    none, nothing = np.zeros(len(signal), bool), np.full(len(signal), np.nan)
+    if not len(order):
+        zeros = np.zeros(MOST_DEGREES)
+        return np.nan, np.inf, zeros, zeros, np.nan, 0.0, 0, False, none, nothing, nothing, signal, 1.0 * none
     full_scale = float(levels.signal[-1])
     n, curve = _longest(levels, full_scale)
     if curve.described:
@@ -125,48 +138,52 @@ def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
     degree = len(curve.coefficients) - 1
     bend[:degree] = curve.coefficients[1:] / gain
     bend_error[:degree] = np.sqrt(np.diagonal(curve.covariance)[1 : degree + 1]) * curve.scale / gain
-    used, weight, level_gain, level_error = np.zeros(len(signal), bool), *np.full((3, len(signal)), np.nan)
+    used, weight, level_gain, level_error = none, 0 * signal, nothing, nothing.copy()
     used[order[:n]] = True
     level_gain[order], level_error[order] = levels.excess / levels.signal, levels.error / levels.signal
     # With `weight` degrees of freedom a level adds weight / 2 (K S / V)^2 to the information on log K.
     variance = flats.variance_dn2[order[:n], c]
-    weight[order[:n]] = 2 * (variance / levels.excess[:n] * gain / standard_error) ** 2 * share / share.sum()
+    above = variance / (variance - read[order[:n]])
+    weight[order[:n]] = 2 * (above * gain / standard_error) ** 2 * share / share.sum()
     fit = gain, standard_error, bend, bend_error, full_scale, curve.chi2, curve.dof, curve.described
-    return *fit, used, level_gain, level_error, signal, np.nan_to_num(weight)
+    return *fit, used, level_gain, level_error, signal, weight
 
 
 def _usable(flats: FlatMoments, c: int, signal, read, read_error) -> tuple[np.ndarray, _Levels]:
     """Places of the levels below saturation whose variance says something, by rising signal, and what it is."""
     variance = flats.variance_dn2[:, c]
-    excess = variance / (1 + row_gain_variance(flats, signal, c)) - read
+    excess = (variance - read) / (1 + row_gain_variance(flats, signal, c))
     error = np.hypot(variance * np.sqrt(2 / flats.dof[:, c]), read_error)
     lit = (signal > 0) & (excess > LEAST_SIGMAS * error) & (variance > NARROW_DN2)
-    if not lit.any():
-        raise ValueError(
-            "flats: no level has a variance above that of the darks; are mean counts and black_level right?"
-        )
     order = np.flatnonzero(lit)[np.argsort(signal[lit], kind="stable")]
-    order = order[: _saturation(excess[order]) + 1]
+    order = order[: _saturation(excess[order]) + 1] if len(order) else order
     return order, _Levels(signal[order], excess[order], error[order])
 
 
 def row_gain_variance(flats: FlatMoments, signal, c: int) -> float:
     """Variance of the gain of rows, which scales the variance within them; 0 if chance."""
+    mean, error = row_gain_of(flats, signal, c)
+    return mean if mean > 5 * error else 0.0
+
+
+def row_gain_of(flats: FlatMoments, signal, c: int) -> tuple[float, float]:
+    """Variance of the gain of rows from what the means of rows have in common, and its standard error."""
     lit = signal > 0
     if not lit.any():
-        return 0.0
+        return 0.0, np.inf
     chance = flats.variance_dn2[lit, c] / flats.row_pixels[lit, c]
     relative = (flats.row_power_dn2[lit, c] - chance) / signal[lit] ** 2
     error = flats.row_power_dn2[lit, c] * np.sqrt(2 / flats.row_dof[lit, c]) / signal[lit] ** 2
     w = 1 / np.maximum(error, 1e-30) ** 2
-    mean = float((w * relative).sum() / w.sum())
-    return mean if mean > 5 / np.sqrt(w.sum()) else 0.0
+    return float((w * relative).sum() / w.sum()), float(1 / np.sqrt(w.sum()))
 
 
 def _saturation(excess: np.ndarray) -> int:
-    """The last level before the variance falls for good: where pixels saturate, it ends at 0."""
-    peak = int(excess.argmax())
-    return peak if (excess[peak + 1 :] < (1 - PAST_PEAK) * excess[peak]).any() else len(excess) - 1
+    """The last level before the variance falls: where pixels saturate, it goes to 0."""
+    falls = np.flatnonzero(excess < (1 - STEEP) * np.maximum.accumulate(excess))
+    end = int(falls[0]) if falls.size else len(excess)
+    peak = int(excess[:end].argmax())
+    return peak if (excess[peak + 1 :] < (1 - PAST_PEAK) * excess[peak]).any() else end - 1
 
 
 def _longest(levels: _Levels, full_scale: float) -> tuple[int, _Curve]:
@@ -222,6 +239,13 @@ def _line(levels: _Levels, n: int) -> tuple[float, float]:
     half = n // 2
     differ = abs(slope(signal[:half], excess[:half]) - slope(signal[half:], excess[half:])) / 2 if half else 0.0
     return gain, float(np.hypot(scatter, differ))
+
+
+def judged(flats: FlatMoments, found: FlatGain) -> FlatMoments:
+    """The flats with the curve of their variance, and the weight of each level in the likelihood."""
+    channels = range(flats.mean_dn.shape[1])
+    curve = np.stack([variance_curve(found, c, np.nan_to_num(found.signal_dn[:, c])) for c in channels], axis=1)
+    return replace(flats, curve=np.where(found.used, curve, 1.0), weight=found.weight)
 
 
 def variance_curve(found: FlatGain, c: int, signal_dn) -> np.ndarray:

@@ -170,8 +170,9 @@ def _replicates(summary: Summary) -> tuple[_Points, _Setting, np.ndarray]:
     row_pixels = np.broadcast_to(row_pixels[:, None], level.shape[1:])
     levels = len(np.unique(summary.exposure_s))
     if summary.flats is not None:
-        points, row_pixels, scale = _with_flats(points, row_pixels, scale, summary.flats)
-        levels += len(summary.flats.exposure_s)
+        flats = summary.flats.straightened()
+        points, row_pixels, scale = _with_flats(points, row_pixels, scale, flats)
+        levels += len(flats.exposure_s)
     return points, _Setting(summary, row_pixels, levels > 1), scale
 
 

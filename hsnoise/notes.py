@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from hsnoise.physics import flat_variance
+from hsnoise.flat_notes import flat_notes
 from hsnoise.profile import WEAK
 from hsnoise.result import FitResult
 from hsnoise.statistics import RowHistograms
@@ -23,7 +23,7 @@ DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 
 def closing_notes(result: FitResult) -> tuple[str, ...]:
     """All sentences that belong under the table of `result`."""
-    misfit = _misfit_notes(result) if result.summary.histograms else _flat_notes(result)
+    misfit = _misfit_notes(result) if result.summary.histograms else flat_notes(result)
     circumstances = (note(result) for note in (_left_out_note, _order_note, _warming_note, _light_note))
     return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
 
@@ -120,7 +120,7 @@ def _misfit_notes(result: FitResult) -> list[str]:
                 " effect that it lacks; read its parameters and standard errors with that in mind."
             )
             break
-    return notes + _flat_notes(result)
+    return notes + flat_notes(result)
 
 
 def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int, float, float]:
@@ -135,23 +135,6 @@ def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int,
     chance = 0.5 * np.sqrt(2 / np.pi) * scatter.sum(1)
     e = int((share - 3 * chance).argmax())
     return e, float(share[e]), float(chance[e])
-
-
-def _flat_notes(result: FitResult) -> list[str]:
-    """Whether the flats follow the straight line of photon transfer."""
-    flats = result.summary.flats
-    if flats is None:
-        return []
-    expected = flat_variance(result.physics, flats)
-    excess = flats.variance_dn2 / expected - 1
-    z = excess * np.sqrt(flats.dof / 2)
-    if np.abs(z).max() < 5:
-        return []
-    return [
-        f"The variance of the flats leaves the photon transfer line by {excess.min():+.1%} to {excess.max():+.1%}"
-        f" (up to {np.abs(z).max():.0f} standard errors): the response bends or darks and flats disagree, and the gain"
-        " holds only on average."
-    ]
 
 
 def _left_out_note(result: FitResult) -> list[str]:

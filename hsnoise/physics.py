@@ -1,4 +1,4 @@
-"""The exact likelihood of dark frames from their row histograms, and of flats from their photon transfer.
+"""The exact likelihood of dark frames from their row histograms; that of flats is in flat_likelihood.py.
 
 P(y | beta) is a difference of the distribution function of Poisson(lambda) + Normal(0, sigma^2) at the edges of the
 count (the first and last bin take the tails); a row's curve over beta is its histogram times log P; rows.py
@@ -16,6 +16,8 @@ import numpy as np
 
 from hsnoise import rows
 from hsnoise._numerics import bin_probability, distribution, poisson_normal_law
+from hsnoise.flat_gain import FlatGain, flat_gain
+from hsnoise.flat_likelihood import FlatLaw, flat_log_likelihood, without_light
 from hsnoise.flats import FlatMoments
 from hsnoise.model import NoiseModel
 from hsnoise.statistics import Summary
@@ -24,7 +26,6 @@ from hsnoise.statistics import Summary
 # the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.
 FLOOR = 1e-10
 LEAST_ROW_SIGMA = 1e-6  # the integral over the gains of rows that have none
-ROUNDING_VARIANCE = 1 / 12  # of rounding to whole counts, DN^2
 
 
 class Physics(eqx.Module):
@@ -110,7 +111,7 @@ def evaluate(physics: Physics, summary: Summary, rules: Rules) -> jax.Array:
         for rule in rules:
             total += rows_log_likelihood(physics, rule, laws, summary)
     if summary.flats is not None:
-        total += flat_log_likelihood(physics, summary)
+        total += flat_log_likelihood(flat_law(physics, summary.flats), summary.flats)
     return total
 
 
@@ -227,38 +228,20 @@ def black_level_at(physics: Physics, exposure_s):
     return physics.black_level[None, :] - clamp[None, :] * exposure_s[:, None]
 
 
-def flat_log_likelihood(physics: Physics, summary: Summary) -> jax.Array:
-    """Photon transfer of flats: temporal variance against mean, and row power. Light levels are profiled out.
-
-    variance = gain^2 (light + read_noise^2) (1 + row_sigma^2) + 1/12; the light of a level is what its mean says, and
-    where the photons are known the mean itself counts (EMVA 1288 release 4, section 6).
-    """
-    flats = summary.flats
-    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s)
-    row_variance = jnp.zeros_like(gain) if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
-    signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
-    variance = flat_variance(physics, flats)
-    total = _gamma_log_density(flats.variance_dn2, flats.dof, variance).sum()
-    row_power = row_variance * signal**2 + variance / jnp.asarray(flats.row_pixels)
-    total += _gamma_log_density(flats.row_power_dn2, flats.row_dof, row_power).sum()
-    if flats.photons_e is not None:
-        photons = jnp.nan_to_num(jnp.asarray(flats.photons_e))[:, None]
-        dark = physics.dark_current * jnp.asarray(flats.exposure_s)[:, None]
-        residual = jnp.asarray(flats.mean_dn) - black - gain * (photons + dark)
-        mean_variance = row_power / (jnp.asarray(flats.row_dof) + 1)
-        known = jnp.isfinite(jnp.asarray(flats.photons_e))[:, None]
-        total += jnp.where(known, -0.5 * residual**2 / mean_variance - 0.5 * jnp.log(mean_variance), 0.0).sum()
-    return total
+def flat_law(physics: Physics, flats: FlatMoments) -> FlatLaw:
+    """What the moments of flats stand on."""
+    return FlatLaw(
+        gain=physics.gain,
+        black_dn=black_level_at(physics, flats.exposure_s),
+        dark_e=physics.dark_current * jnp.asarray(flats.exposure_s),
+        read_noise_e=physics.read_noise,
+        row_variance=0.0 * physics.gain if physics.row_sigma is None else physics.row_sigma**2,
+    )
 
 
-def flat_variance(physics: Physics, flats: FlatMoments):
-    """Expected temporal variance within rows [level, channel], DN^2: the photon transfer line."""
-    gain, black = physics.gain[None, :], black_level_at(physics, flats.exposure_s)
-    row_variance = 0.0 if physics.row_sigma is None else physics.row_sigma[None, :] ** 2
-    signal = jnp.maximum(jnp.asarray(flats.mean_dn) - black, 1e-3)
-    return (gain * signal + (gain * physics.read_noise) ** 2) * (1 + row_variance) + ROUNDING_VARIANCE
-
-
-def _gamma_log_density(measured, dof, expected):
-    """Log density of a mean square with `dof` degrees of freedom, up to a constant."""
-    return -0.5 * jnp.asarray(dof) * (jnp.log(expected) + jnp.asarray(measured) / expected)
+def flat_gain_of(physics: Physics, flats: FlatMoments) -> FlatGain:
+    """Gain of the flats alone, above black and noise of the darks where they were measured, else of `physics`."""
+    with jax.enable_x64(True):
+        law = flat_law(jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), physics), flats)
+        black_dn, variance_dn2 = (np.asarray(x) for x in without_light(law, flats))
+    return flat_gain(flats, black_dn, variance_dn2, np.nan_to_num(flats.dark_error_dn2))

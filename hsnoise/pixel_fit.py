@@ -8,11 +8,12 @@ docs/likelihood.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hsnoise.flat_gain import FlatGain, flat_gain
+from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
+from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.pixels.population import Population, population_of
 from hsnoise.pixels.structure import double_differences, plane_rows
@@ -70,7 +71,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
         black = np.array([one.black_dn[0] for one in channels])
         floor, error = (np.array([f(one) for one in channels]) for f in (_floor, _floor_error))
         flats = flat_gain(summary.flats, black, floor, error)
-        channels = [_with_flats(one, flats, c) for c, one in enumerate(channels)]
+        channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
     estimate, covariance = _joint(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
@@ -163,13 +164,14 @@ def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
     return (float(theta[1]), error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
 
 
-def _with_flats(one: Channel, flats: FlatGain, c: int) -> Channel:
-    """The channel with the gain that its flats give; that of its darks is left for a check."""
+def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
+    """The channel with the gain, and the gain of rows, that its flats give; those of its darks are left for a check."""
     values, covariance = one.values.copy(), one.covariance.copy()
     values[0] = flats.gain[c]
     covariance[0], covariance[:, 0] = 0.0, 0.0
     covariance[0, 0] = flats.standard_error[c] ** 2
-    return Channel(one.name, one.transfer, one.population, values, covariance, one.black_dn, one.row_gain)
+    rows = row_gain_of(moments, flats.signal_dn[:, c], c)
+    return replace(one, values=values, covariance=covariance, row_gain=rows)
 
 
 def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,7 @@ from hsnoise.pixels.transfer import ROUNDING
 from hsnoise.result import FitResult
 from hsnoise.statistics import Summary
 
+FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
 THERE = 5.0  # standard errors from which an effect of the population is in the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not tell it
 IN_ELECTRONS = ("gain", "dark_current.rate", "read_noise.sigma")
@@ -120,6 +121,9 @@ def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[
         "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in many]),
         "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in many]),
     }
+    fano = _fano(pixel)
+    if fano is not None:
+        hot["fano"] = fano
     if spread[0] > 0:
         found["dark_current_nonuniformity"] = {"spread": spread}
     if offset[0] > THERE * offset[1]:
@@ -127,6 +131,23 @@ def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[
     if hot["fraction"][0] > THERE * hot["fraction"][1] and hot["rate"][0] > 0:
         found["hot_pixels"] = hot
     return found
+
+
+def _fano(pixel: PixelFit) -> tuple[float, float] | None:
+    """Fano factor of the hot pixels, where it is below 1 beyond chance; flats tell it better than ordinary pixels."""
+    told = []
+    for c, channel in enumerate(pixel.channels):
+        t = channel.transfer
+        if t is None or not np.isfinite(t.hot_gain) or not pixel.determined:
+            continue
+        gain, error = pixel.estimate[c], np.sqrt(pixel.covariance[c, c])
+        ratio = t.hot_gain / gain
+        told.append((ratio, ratio * np.hypot(t.hot_error / t.hot_gain, error / gain)))
+    if not told:
+        return None
+    weight = np.array([e**-2 for _, e in told])
+    value, error = float(weight @ [v for v, _ in told] / weight.sum()), float(weight.sum() ** -0.5)
+    return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
 
 
 def _with(pixel: PixelFit, many):
@@ -176,8 +197,8 @@ def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Su
     classes = {cls.name: cls for cls in (DarkCurrentNonuniformity, DarkSignalNonuniformity, HotPixels)}
     for name in wanted:
         if name in classes:
-            fields = {field: 0.0 for field in classes[name].specs()}
-            fields |= {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
+            fields = {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
+            fields = fields or {field: spec.low for field, spec in classes[name].specs().items() if field != "fano"}
             effects.append(classes[name](**fields))
     t = np.sort(summary.exposure_s)
     return NoiseModel(effects, cfa=summary.cfa, shutter=summary.shutter, exposure_s=float(t[len(t) // 2]))

@@ -144,13 +144,12 @@ def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) ->
     """
     tick = callback("progress", progress)
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
     coding = coding_of(stack) if coding is None else coding
     plan = _Plan.of(stack, darks, coding)
     return Summary(
         exposure_s=np.asarray([stack.exposure_s[i] for i in darks], np.float64),
         histograms=_row_histograms(stack, darks, tick, coding, plan) if darks else (),
-        flats=flat_moments(stack, flats, tick) if flats else None,
+        flats=flat_moments(stack, tick),
         black_level_dn=_black_per_channel(stack),
         white_level_dn=stack.white_level,
         cfa=stack.cfa,

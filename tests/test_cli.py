@@ -13,6 +13,7 @@ import pytest
 
 import hsnoise
 from hsnoise import _options, _output, cli
+from hsnoise._loading import load_capture
 from hsnoise.cli import main
 from hsnoise.criticism import Comparison, Step, Story
 
@@ -215,7 +216,7 @@ def test_darks_flats_and_options_reach_the_stack(tmp_path):
         str(tmp_path / "flats"),
     ]
     args = _options.parser().parse_args(["fit", str(tmp_path / "darks"), *options])
-    stack = cli._load(args.paths, args)
+    stack = load_capture(args.paths, args)
     assert (stack.kind, stack.n_frames, stack.shape) == (("dark", "dark", "flat"), (1, 1, 2), (20, 30))
     assert (stack.cfa, stack.shutter, stack.white_level) == ("GBRG", "global", 4095)
     np.testing.assert_array_equal(stack.exposure_s, [1, 2, 0.5])

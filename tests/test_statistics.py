@@ -299,7 +299,7 @@ def test_photon_transfer_of_flats_is_unbiased(rng, cfa, light_e):
         mean = BLACK_DN + GAIN * electrons.mean(0)
         variance = GAIN**2 * (1 + ROW_SIGMA**2) * (electrons.mean(0) + READ_E**2) + 1 / 12
         row_power = (GAIN * ROW_SIGMA) ** 2 * (electrons**2).mean(0) + variance / pixels
-        np.testing.assert_array_equal(measured.dof[i], rows * (pixels - 1) * (n - 1))
+        np.testing.assert_allclose(measured.dof[i], (rows - 1) * (pixels - 1) * (n - 1))
         np.testing.assert_array_equal(measured.row_dof[i], (rows - 1) * (n - 1))
         np.testing.assert_array_equal(measured.row_pixels[i], pixels)
         errors = (
@@ -310,8 +310,11 @@ def test_photon_transfer_of_flats_is_unbiased(rng, cfa, light_e):
         np.testing.assert_array_less(np.abs(errors), 5.0)
 
 
-def test_a_flat_of_one_frame_is_refused(rng):
+def test_a_flat_of_one_frame_is_set_aside(rng):
     counts = [dark_counts(rng, 2, (8, 12)), dark_counts(rng, 1, (8, 12), mean=300)]
     stack = FrameStack(counts, [0.1, 0.25], kind=("dark", "flat"))
-    with pytest.raises(ValueError, match=r"exposure group 1 \(0\.25 s\) has one frame; .* at least two frames"):
-        summarise(stack)
+    flats = summarise(stack).flats
+    assert flats.mean_dn.shape == (0, 1) and "0.25 s) is set aside: a single frame" in flats.set_aside[0]
+    singles = [dark_counts(rng, 1, (8, 12), mean=mean) for mean in (300, 900)]
+    with pytest.raises(ValueError, match="flats: none can be used"):
+        summarise(FrameStack(singles, [0.1, 0.25], kind="flat"))

@@ -35,9 +35,9 @@ def load(
     are set aside, and flats of another crop go to `elsewhere`; `assumed` of the stack tells of all this.
 
     Args:
-        path: a folder, a glob pattern, one file, or a list of files. A folder's files and those of the folders in it
-            are taken in natural order (frame2 before frame10), files of no known format are passed over. A folder with
-            EMVA1288_Data.txt is read as that says.
+        path: a folder, a glob pattern, one file, or a list of files and folders. A folder's files and those of the
+            folders in it are taken in natural order (frame2 before frame10), files of no known format are passed over.
+            A folder with EMVA1288_Data.txt is read as that says.
         exposure_s: exposure time, s; one for all, or one a file (one an exposure for a file of several).
         kind: "dark" or "flat", likewise. None: what the files say, or else their names and those of their folders
             (bias, zero, dark, flat, darkflat, ...), or else "dark".
@@ -68,4 +68,4 @@ def load(
         roi=roi,
         row_axis=one_of("row_axis", row_axis, (0, 1)),
         **options,
-    ).stack
+    )

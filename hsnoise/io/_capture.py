@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,40 +37,32 @@ _LONG_READ = 16  # files from which on a progress bar is shown
 Groups = list[list[Recording]]
 
 
-@dataclass(frozen=True)
-class Capture:
-    """A stack, and for each of its groups the recordings that it was made of."""
-
-    stack: FrameStack
-    groups: Groups
-
-
 def read_capture(
     path: Any, *, exposure_s: Any, kind: Any, cfa: str | None, overscan: Any, progress: bool, roi: Any, **keywords: Any
-) -> Capture:
-    """What `hsnoise.load` does, with the files of each group; `keywords` are levels, shutter and row_axis."""
+) -> FrameStack:
+    """What `hsnoise.load` does; `keywords` are levels, shutter and row_axis."""
     read, root, told, source = _recordings(path, progress)
+    read = read if exposure_s is None else _with_given(read, exposure_s)
     read, about_kinds = with_kinds(read, kind, root)
-    read, about_exposures = _with_exposures(read, exposure_s, root)
+    read, about_exposures = _with_exposures_of_names(read, root)
     if cfa is not None:
         read = [replace(one, cfa=cfa) for one in read]
     found = sort_out(read, root)
     _check_exposures([*found.main, *found.elsewhere], source)
     gain, about_gain = _stated_gain([*found.main, *found.elsewhere])
-    stacks, groups, about_levels = [], [], []
+    stacks, about_levels = [], []
     black_dn = _black_dn(found.main)
     for some, region in ((found.main, roi), (found.elsewhere, None)):
         if some:
             given = keywords["white_level"]
             white_level = _shared(some, "white_level") if given is None else given
             levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
-            groups.append(levels)
             about_levels += about
             stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
             stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
     joined = FrameStack.join(*stacks)
-    return Capture(replaced(joined, assumed=(*assumed, *joined.assumed)), groups[0])
+    return replaced(joined, assumed=(*assumed, *joined.assumed))
 
 
 def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
@@ -86,13 +78,16 @@ def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[
     return [one for path in tracked for one in reader.read(path)], root, passed + others, reader.EXPOSURE_FROM
 
 
-def _with_exposures(read: list[Recording], exposure_s: Any, root: Path) -> tuple[list[Recording], list[str]]:
-    """Exposures as given, or as the files say, or else as their names do, which is told."""
-    if exposure_s is not None:
-        given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
-        values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
-        _warn_of_other_exposures(read, values)
-        return [replace(recording, exposure_s=value) for recording, value in zip(read, values, strict=True)], []
+def _with_given(read: list[Recording], exposure_s: Any) -> list[Recording]:
+    """Exposures as given; warns if a file says another."""
+    given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
+    values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
+    _warn_of_other_exposures(read, values)
+    return [replace(recording, exposure_s=value) for recording, value in zip(read, values, strict=True)]
+
+
+def _with_exposures_of_names(read: list[Recording], root: Path) -> tuple[list[Recording], list[str]]:
+    """Exposures that only the names of files and folders tell, and a sentence that says so."""
     out = [
         recording
         if recording.exposure_s is not None

@@ -35,16 +35,20 @@ def root_of(path: Any, paths: list[Path]) -> Path:
 
 
 def paths_of(path: Any) -> tuple[list[Path], list[str]]:
-    """The files meant, of known formats in a folder and those below it, of any in a list; and what was passed over.
+    """The files meant, of known formats in folders and those below, of any named in a list; and what was passed over.
 
     Raises:
         FileNotFoundError: there is none, or one of them is missing. TypeError: a path is none.
     """
+    paths: list[Path] = []
     told: list[str] = []
     if not isinstance(path, str | Path):
         if not isinstance(path, Iterable):
             raise TypeError(f"path: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}")
-        paths = [Path(one) for one in path]
+        for one in map(Path, path):
+            inside, passed = _below(one) if one.is_dir() else ([one], [])
+            paths += inside
+            told += passed
     elif Path(path).is_dir():
         paths, told = _below(Path(path))
     elif glob.has_magic(str(path)) and not Path(path).exists():

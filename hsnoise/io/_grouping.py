@@ -46,14 +46,15 @@ def group_temperature_c(group: Sequence[Recording]) -> float:
 
 
 def group_counts(group: Sequence[Recording]) -> Any:
-    """All frames of a group, `[frame, row, column]`; lazy if there is more than one file."""
-    if len(group) == 1:
+    """All frames of a group, `[frame, row, column]`; lazy if there is more than one file, or if their time is known."""
+    if len(group) == 1 and group[0].taken is None:
         return group[0].counts
-    readers, names = [], []
+    readers, names, taken = [], [], []
     for recording in group:
         counts = recording.counts
         readers += [lambda counts=counts, i=i: counts[i] for i in range(counts.shape[0])]
         lazy = isinstance(counts, LazyFrames)
         names += counts.names if lazy else [f"{recording.path}, frame {i}" for i in range(counts.shape[0])]
+        taken += [recording.taken] * counts.shape[0]
     dtype = np.result_type(*(recording.counts.dtype for recording in group))
-    return LazyFrames(readers, group[0].counts.shape[1:], dtype, names)
+    return LazyFrames(readers, group[0].counts.shape[1:], dtype, names, taken)

@@ -9,7 +9,6 @@ from hsnoise.pixels.classes import hot_from, levels_of, slope_over
 from hsnoise.pixels.survey import Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
-NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
 DIM = 0.5  # of the median response to light: below it a pixel is dead
 RARE = 1e-5  # chance of a variance so high, in each half of the frames
 
@@ -20,14 +19,15 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     if not halves or halves[0][0] is None:
         return np.zeros(0, np.uint8)
     flags = np.zeros(sum(h.level_dn.shape[1] for h in halves[0]), np.uint8)
-    flags[_stuck(halves)] |= FLAGS["stuck"]
+    flags[found.stuck(channel)] |= FLAGS["stuck"]
     lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     if lit:
         flags[_dead(found, channel)] |= FLAGS["dead"]
     pixels = levels_of(found, channel)
     if pixels is not None:
         growth = slope_over(pixels.exposure_s, pixels.level)
-        flags[growth.min(0) > hot_from(growth)] |= FLAGS["hot"]
+        moving = np.flatnonzero(~found.stuck(channel))
+        flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
     dark = [[p.halves for p in g.planes if p.channel == channel] for g in found.darks if g.n_frames > 1]
     flags[_jumping(dark, len(flags)) & (flags & FLAGS["stuck"] == 0)] |= FLAGS["telegraph"]
     return flags
@@ -36,17 +36,6 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
 def counts_of(flags: np.ndarray) -> dict[str, float]:
     """Share of the pixels with each flag."""
     return {name: float(np.mean(flags & bit > 0)) if flags.size else float("nan") for name, bit in FLAGS.items()}
-
-
-def _stuck(halves) -> np.ndarray:
-    """Pixels that have the same count in all frames, where others are noisy."""
-    still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
-    noisy = [np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2 for of in halves]
-    # Few frames of little noise may agree by chance.
-    frames = sum(sum(of[0].n_frames) for of, loud in zip(halves, noisy, strict=True) if loud)
-    if frames < 4:
-        return np.zeros(len(still[0]), bool)
-    return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
 
 
 def _dead(found: Survey, channel: int) -> np.ndarray:

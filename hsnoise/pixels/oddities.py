@@ -11,7 +11,7 @@ from hsnoise.pixels.survey import Group, Survey
 
 ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by which its noise differs from the others'
 LEAST_LEVEL_DN = 0.5
-MANY = {"stuck": 5e-4, "telegraph": 2e-3}  # shares of pixels that are worth a sentence
+MANY = {"stuck": 5e-4, "telegraph": 5e-3}  # shares of pixels that are worth a sentence
 QUIET = 0.05  # of the other colours' noise: a colour that is dead
 FEWEST = 3  # frames, of which one can be told to be odd
 

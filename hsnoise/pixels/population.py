@@ -33,7 +33,8 @@ class Population:
     Attributes:
         mean: of ordinary pixels, whatever the limit at which others are called hot.
         spread: of ln dark current of ordinary pixels (0: they do not differ).
-        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current.
+        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current:
+            with it the mean over all pixels is the measured one.
         at_readout: extra charge of hot pixels whatever the exposure, mean, DN.
         offset_sigma: standard deviation of offsets over pixels, rows and columns taken off.
         median, quantiles: of the measured growth, DN/s; quantiles at 1, 16, 84, 99, 99.9 %.
@@ -76,6 +77,10 @@ def population_of(
     # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
     cut = _mean_below(limit - pedestal_dn_per_s, noise, values)
     mean = ordinary + (body - cut if spread > 0 or fraction > 0 else 0.0)
+    if fraction > 0:  # whatever the shape of the tail, its charge is kept
+        total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
+        rate = max((total - mean) / fraction, 0.0)
+        errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
     shortest = float(pixels.exposure_s.min())
     return Population(
         mean=mean,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.pixels.classes import HOT_SIGMAS
 from hsnoise.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
@@ -14,7 +14,7 @@ SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
 STREAKS = 0.04  # variance of row means over that of pixels from which streaks rule the noise
-CLIPPED = 0.01  # share of clipped counts from which the moments of pixels over time are no longer those of the noise
+CLIPPED = 0.3  # share of clipped counts from which the moments of pixels over time say too little of the noise
 
 
 class Static(NamedTuple):
@@ -71,12 +71,21 @@ def pixels_differ(found: Survey) -> bool:
             one = static_of(found, group, c)
             if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
                 return True
-        pixels = levels_of(found, c)
-        if pixels is not None:
-            growth = slope_over(pixels.exposure_s, pixels.level)
-            if np.mean(growth.min(0) > hot_from(growth)) > MANY_HOT:
-                return True
+        if _always_bright(found, c) > MANY_HOT:
+            return True
     return False
+
+
+def _always_bright(found: Survey, channel: int) -> float:
+    """Share of pixels that stand out in every frame of the longest exposure: hits and jumps do not."""
+    several = [g for g in found.darks if g.n_frames > 1]
+    if not several:
+        return 0.0
+    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).planes if p.channel == channel]
+    lowest = np.concatenate([h.lowest for h in halves]).astype(np.float64)
+    sigma = float(np.sqrt(np.median(np.concatenate([h.pair_variance_dn2 for h in halves]))))
+    level = float(np.median(np.concatenate([h.level_dn for h in halves], 1)))
+    return float(np.mean((lowest > level + HOT_SIGMAS * max(sigma, 0.5))[~found.stuck(channel)]))
 
 
 def can_be_transferred(found: Survey) -> bool:

@@ -13,6 +13,9 @@ from hsnoise.decomposition import COMPONENTS, Component, PlaneSums
 from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
 from hsnoise.stack import FrameStack
 
+NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
+FEWEST_STILL = 4  # frames
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -66,6 +69,16 @@ class Survey:
     sampled_rows: np.ndarray
     shape: tuple[int, int]
     full_scale_dn: float
+
+    def stuck(self, channel: int) -> np.ndarray:
+        """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
+        halves = [[p.halves for p in g.planes if p.channel == channel] for g in self.groups if g.n_frames > 1]
+        still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
+        noisy = [np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2 for of in halves]
+        frames = sum(sum(of[0].n_frames) for of, loud in zip(halves, noisy, strict=True) if loud)
+        if frames < FEWEST_STILL:  # few may agree by chance
+            return np.zeros(len(still[0]) if still else 0, bool)
+        return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
 
     @property
     def darks(self) -> tuple[Group, ...]:

@@ -6,10 +6,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.physics import ROUNDING_VARIANCE, Physics, black_level_at
+from hsnoise.flat_gain import FlatGain, local_gain, variance_curve
+from hsnoise.flat_likelihood import ROUNDING_VARIANCE
+from hsnoise.moments import binned_moments
+from hsnoise.physics import Physics, black_level_at, flat_gain_of
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy, title_of
-from hsnoise.statistics import RowHistograms, Summary
+from hsnoise.statistics import RowHistograms, Summary, far_outliers
 
 CLIPPED_FRACTION = 1e-3
 CURVE_POINTS = 40
@@ -19,9 +22,11 @@ def photon_transfer(fit) -> Figure:
     """Variance against mean of the counts, measured and fitted: the photon transfer curve.
 
     Darks: one point per exposure and colour, its variance taken within rows, so that row offsets and the spread
-    of row gains between rows do not enter. Flats: one point per level and colour, temporal variance within
-    rows. Solid: what the fitted model expects of the recorded counts; dashed, where clipping matters: what the
-    sensor delivered before it was clipped. Hollow points: more than 0.1 % of the pixels are clipped.
+    of row gains between rows do not enter, nor do pixels far hotter than all others. Flats: one point per level and
+    colour, temporal variance within rows above that of the darks; and that over signal, with the curve that was fitted
+    and the gain that follows from it at each signal. Solid: what the fitted model expects of the recorded counts;
+    dashed, where clipping matters: what the sensor delivered before it was clipped. Hollow points: more than 0.1 % of
+    the pixels are clipped, or a level was left out.
 
     Args:
         fit: result of `hsnoise.fit`.
@@ -29,24 +34,27 @@ def photon_transfer(fit) -> Figure:
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
     summary, physics = fit.summary, fit.physics
-    panels = [draw for draw, there in ((_darks, summary.histograms), (_flats, summary.flats is not None)) if there]
+    lit = summary.flats is not None and summary.flats.mean_dn.size > 0
+    drawings = ((_darks, bool(summary.histograms)), (_flats, lit), (_gains, lit))
+    panels = [draw for draw, there in drawings if there]
     figure = new_figure(6.4 * len(panels), 5.0, title_of("Photon transfer: variance against mean of the counts", fit))
     for axes, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         draw(axes, physics, summary)
         axes.set_xlabel("mean above black level / DN")
-        axes.set_ylabel("variance within rows / DN²")
         tidy(axes)
     return figure
 
 
 def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.set_title("dark frames, one point per exposure", fontsize=10)
+    axes.set_ylabel("variance within rows / DN²")
+    far = far_outliers(summary) > 0
     t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
         channel, black = histograms.channel, black_level_at(physics, summary.exposure_s)[:, c]
         colour = COLOURS[channel]
-        mean, variance, error = _within_rows(histograms)
+        mean, variance, error = _within_rows(histograms, far & ~_reaches_white(histograms, summary.white_level_dn))
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION
         _points(axes, channel, mean - black, variance, clipped, error)
         x, y = _expected(physics, c, t, summary.white_level_dn)
@@ -64,21 +72,57 @@ def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
 
 def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.set_title("flat frames, one point per level", fontsize=10)
-    flats = summary.flats
-    white = np.inf if summary.white_level_dn is None else summary.white_level_dn
+    axes.set_ylabel("variance above that of darks / DN²")
+    found = flat_gain_of(physics, summary.flats)
     for c, channel in enumerate(summary.channels):
-        black = black_level_at(physics, flats.exposure_s)[:, c]
-        signal, variance = flats.mean_dn[:, c] - black, flats.variance_dn2[:, c]
-        clipped = (flats.mean_dn[:, c] + 3 * np.sqrt(variance) > white) | (flats.mean_dn[:, c] < 3 * np.sqrt(variance))
-        _points(axes, channel, signal, variance, clipped, variance * np.sqrt(2 / flats.dof[:, c]))
-        positive = signal[signal > 0]
-        if len(positive):
-            light_dn = np.geomspace(positive.min() / 2, positive.max() * 1.5, CURVE_POINTS)
-            axes.plot(light_dn, _line(physics, c, light_dn), color=COLOURS[channel], linewidth=1.6)
+        signal, shown = _levels(found, c)
+        gain, error = found.level_gain[shown, c], found.level_error[shown, c]
+        _points(axes, channel, signal, gain * signal, ~found.used[shown, c], error * signal)
+        if len(signal):
+            light_dn = np.geomspace(signal.min() / 2, signal.max() * 1.5, CURVE_POINTS)
+            expected = float(physics.gain[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
+            axes.plot(light_dn, expected * (1 + _row_sigma(physics, c) ** 2), color=COLOURS[channel], linewidth=1.6)
     axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.legend(fontsize=9, framealpha=0.9)
+
+
+def _gains(axes: Axes, physics: Physics, summary: Summary) -> None:
+    """Variance over signal of the flats and the local gain: level where the response is straight."""
+    axes.set_title("flat frames: gain against signal", fontsize=10)
+    axes.set_ylabel("variance over signal, gain / (DN/e$^-$)")
+    found = flat_gain_of(physics, summary.flats)
+    for c, channel in enumerate(summary.channels):
+        signal, shown = _levels(found, c)
+        used = found.used[shown, c]
+        _points(axes, channel, signal, found.level_gain[shown, c], ~used, found.level_error[shown, c])
+        if used.any():
+            light_dn = np.geomspace(signal[used].min(), signal[used].max() * 1.001, CURVE_POINTS)
+            axes.plot(
+                light_dn, found.gain[c] * variance_curve(found, c, light_dn), color=COLOURS[channel], linewidth=1.6
+            )
+            axes.plot(light_dn, local_gain(found, c, light_dn), "--", color=COLOURS[channel], linewidth=1.2)
+    axes.plot([], [], "-", color="0.3", label="curve of the variance")
+    axes.plot([], [], "--", color="0.3", label="local gain")
+    axes.set_xscale("log")
+    _gain_limits(axes, found)
+    axes.legend(fontsize=9, framealpha=0.9)
+
+
+def _gain_limits(axes: Axes, found: FlatGain) -> None:
+    """Limits by the levels that gave the gain: those near saturation may fall far below."""
+    shown = found.level_gain[found.used]
+    if shown.size:
+        low, high = min(shown.min(), found.gain.min()), max(shown.max(), found.gain.max())
+        margin = max(0.5 * (high - low), 0.05 * high)
+        axes.set_ylim(low - margin, high + margin)
+
+
+def _levels(found: FlatGain, c: int) -> tuple[np.ndarray, np.ndarray]:
+    """Signals, DN, of the levels of a channel that can be drawn, and where they are [level]."""
+    shown = np.isfinite(found.level_gain[:, c]) & (found.level_gain[:, c] > 0)
+    return found.signal_dn[shown, c], shown
 
 
 def _points(axes: Axes, channel: str, x, y, clipped, error) -> None:
@@ -89,26 +133,39 @@ def _points(axes: Axes, channel: str, x, y, clipped, error) -> None:
     axes.plot([], [], MARKERS[channel], color=colour, label=NAMES[channel])
 
 
-def _within_rows(histograms: RowHistograms):
-    """Mean (DN), variance within rows (DN^2) and its standard error over frames, each [exposure]."""
+def _within_rows(histograms: RowHistograms, far: np.ndarray):
+    """Mean (DN), variance within rows (DN^2) and its standard error over frames, each [exposure].
+
+    far [exposure]: whether pixels beyond all bins, far hotter than the others, are to be left out.
+    """
     pixels = histograms.row_pixels  # [exposure, frame, row]; 0 in padding
     used = pixels[..., 0] > 0
     n = np.maximum(pixels, 2)
+    row_mean = histograms.row_sum / n
     row_variance = (histograms.row_sum_of_squares - histograms.row_sum**2 / n) / (n - 1)
+    if far.any():
+        _, binned_mean, binned_variance = binned_moments(histograms)
+        row_mean = np.where(far[:, None, None], binned_mean, row_mean)
+        row_variance = np.where(far[:, None, None], binned_variance, row_variance)
     frames = used.sum(1)
-    mean = histograms.row_sum.sum((1, 2)) / pixels.sum((1, 2))
+    mean = (row_mean * pixels).sum((1, 2)) / pixels.sum((1, 2))
     of_frame = [row_variance[e][used[e]].mean(1) for e in range(len(used))]
     variance = np.array([one.mean() for one in of_frame])
     spread = [one.std(ddof=1) if len(one) > 1 else np.nan for one in of_frame]
     return mean, variance, np.array(spread) / np.sqrt(frames)
 
 
+def _reaches_white(histograms: RowHistograms, white_level_dn: float | None) -> np.ndarray:
+    """Whether the last bin begins at the white level [exposure]."""
+    no = np.zeros(len(histograms.edges_dn), bool)
+    return no if white_level_dn is None else histograms.edges_dn[:, -1] >= white_level_dn - 0.5
+
+
 def clipped_fraction(histograms: RowHistograms, white_level_dn: float | None) -> np.ndarray:
     """Fraction [exposure] of pixels at 0 or at the white level."""
     counts = histograms.counts.sum((1, 2), dtype=np.float64)
     at_zero = np.where(histograms.edges_dn[:, 0] <= 0.5, counts[:, 0], 0.0)
-    reaches_white = white_level_dn is not None and histograms.edges_dn[:, -1] >= white_level_dn - 0.5
-    return (at_zero + np.where(reaches_white, counts[:, -1], 0.0)) / counts.sum(1)
+    return (at_zero + np.where(_reaches_white(histograms, white_level_dn), counts[:, -1], 0.0)) / counts.sum(1)
 
 
 def _expected(physics: Physics, c: int, exposure_s, white_level_dn: float | None):
