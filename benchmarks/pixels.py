@@ -134,7 +134,7 @@ def main() -> None:
     for name in ("seeds", "workers"):
         if getattr(arguments, name) < 1:
             parser.error(f"--{name}: expected at least 1, got {getattr(arguments, name)}")
-    console = Console(width=140)
+    console = Console(width=160)
     if arguments.real:
         console.print(real_sensors(data_folder(), arguments.only).rich())
         return

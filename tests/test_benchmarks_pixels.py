@@ -99,6 +99,8 @@ def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 0.05, "yes"),
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 0.03, "no"),
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 10.0, "no"),
+        (Known("gain", 0.5, 0.52, 0.02), 0.51, 10.0, "no"),
+        (Known("share", 0.5, 0.52, 0.02), 0.51, np.nan, "yes"),
         (Known("gain", 0.5, 0.52, 0.02), np.nan, np.inf, "no"),
         (Known("gain", np.nan, np.nan), np.nan, np.inf, "yes"),
         (Known("gain", np.nan, np.nan), 0.5, 0.01, "no"),
