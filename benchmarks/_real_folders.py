@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 import jax
 import numpy as np
 from astropy.io import fits
-from PIL import Image
 
 import hsnoise
 from benchmarks._sheet import Sheet
@@ -41,7 +40,7 @@ class Known:
 @dataclass(frozen=True)
 class Real:
     """A capture: `place(data, folder)` writes or copies its files to `folder`; each of `says` is a pattern that one of
-    the sentences of the fit, or of the warnings before it, must match."""
+    the sentences of the fit, of what loading assumed or of its warnings must match."""
 
     name: str
     place: Callable[[Path, Path], None]
@@ -86,25 +85,17 @@ def copied(name: str, *folders: str) -> Callable[[Path, Path], None]:
 
 
 def emva(name: str) -> Callable[[Path, Path], None]:
-    """A reference set of EMVA 1288, by its descriptor: lines "b" or "d" with the exposure in ns, then images."""
+    """A reference set of EMVA 1288: its descriptor and the images that it lists."""
 
     def place(data: Path, folder: Path) -> None:
-        source, kind, exposure_s = data / "emva1288" / name, "", 0.0
-        for line in (source / "EMVA1288_Data.txt").read_text().splitlines():
-            word, *rest = line.split() or [""]
-            if word in ("b", "d"):
-                kind, exposure_s = {"b": "flat", "d": "dark"}[word], float(rest[0]) * 1e-9
-            elif word == "i":
-                image = source / rest[0].replace("\\", "/")
-                with Image.open(image) as opened:
-                    _write(folder / kind / f"{image.stem}.fits", np.asarray(opened), kind, exposure_s, {})
+        shutil.copytree(data / "emva1288" / name, folder, dirs_exist_ok=True)
 
     return place
 
 
 def _write(path: Path, frame: np.ndarray, kind: str, exposure_s: float, header: dict) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    hdu = fits.PrimaryHDU(frame if frame.dtype == np.uint8 else frame.astype(np.uint16))
+    hdu = fits.PrimaryHDU(frame)
     hdu.header.update({"EXPTIME": exposure_s, "IMAGETYP": f"{kind.capitalize()} Frame"} | header)
     hdu.writeto(path)
 
@@ -159,15 +150,16 @@ def _lines(real: Real, data: Path) -> list[tuple[str, ...]]:
         try:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                fit = hsnoise.fit(hsnoise.load(folder, progress=False))
+                stack = hsnoise.load(folder, progress=False)
+                fit = hsnoise.fit(stack)
         except (ValueError, OSError) as refusal:
             how = "broke" if isinstance(refusal, np.linalg.LinAlgError) else "refused"
             print(f"{how}: {refusal}", flush=True)
             return [(real.name, k.parameter, _range(k), how, "", _goal(k), "no", "", "", "") for k in real.known]
         seconds = f"{time.perf_counter() - began:.1f} s"
-    warned = [str(one.message) for one in caught]
-    print(*warned, fit, sep="\n", flush=True)
-    sentences = (*warned, *fit.doubts, *fit.notes)
+    before = [*stack.assumed, *(str(one.message) for one in caught)]
+    print(*before, fit, sep="\n", flush=True)
+    sentences = (*before, *fit.doubts, *fit.notes)
     silent = [words for words in real.says if not any(re.search(words, said) for said in sentences)]
     end = ("yes" if fit.trustworthy else "no", seconds, ", ".join(silent) or "-")
     return [
