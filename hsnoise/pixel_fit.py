@@ -66,11 +66,8 @@ class PixelFit:
 def measure(found: Survey, summary: Summary) -> PixelFit:
     """Pixel transfer, flats and population of all channels, and the joint estimate."""
     channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
-    flats = None
-    if summary.flats is not None:
-        black = np.array([one.black_dn[0] for one in channels])
-        floor, error = (np.array([f(one) for one in channels]) for f in (_floor, _floor_error))
-        flats = flat_gain(summary.flats, black, floor, error)
+    flats = None if summary.flats is None else flat_gain(summary.flats)
+    if flats is not None and np.isfinite(flats.gain).all():
         channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
     estimate, covariance = _joint(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
@@ -78,19 +75,13 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
 
 
-def _floor(one: Channel) -> float:
-    return float(one.values[1])
-
-
-def _floor_error(one: Channel) -> float:
-    return float(np.sqrt(one.covariance[1, 1]))
-
-
 def _channel(found: Survey, c: int, name: str) -> Channel:
     pixels = levels_of(found, c)
-    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
     (growth, growth_error), black = _growth_of_means(found, c)
-    floor, floor_error = _temporal(found, c)
+    narrow = _narrow(found, c)
+    floor, floor_error = _temporal(found, c) if narrow is None else _of_narrow(narrow)
+    pixels = pixels if narrow is None else None  # rounding, not light, sets the variance of narrow noise
+    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if transfer is not None and pixels is not None:
@@ -102,6 +93,22 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
     return Channel(name, transfer, population, values, covariance, black, _row_gain(found, c, values[2]))
+
+
+def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
+    """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return None
+    shortest = min(groups, key=lambda g: g.exposure_s)
+    return next((p.narrow_dn for p in shortest.planes if p.channel == c), None)
+
+
+def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
+    """Variance with rounding that stands for narrow noise, and its error: the bound is two of them away."""
+    estimate, bound = narrow
+    middle = estimate if np.isfinite(estimate) else bound / 2
+    return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
 def _temporal(found: Survey, c: int) -> tuple[float, float]:
@@ -177,6 +184,8 @@ def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> 
 def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
     """Gain [channel], read noise and dark current in electrons, which all colours share, by least squares."""
     n = len(channels)
+    if all(one.covariance[0, 0] >= UNKNOWN**2 for one in channels):
+        return np.append(np.ones(n), [0.0, 0.0]), np.eye(n + 2) * UNKNOWN**2
     data = np.concatenate([_without_rows(one) for one in channels])
     weight = np.zeros((3 * n, 3 * n))
     for c, one in enumerate(channels):

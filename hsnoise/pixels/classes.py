@@ -16,7 +16,7 @@ from hsnoise.pixels.survey import Survey
 
 BODY = (0.0, 0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)  # quantiles between which ordinary pixels are classed
 TAIL = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 0.9999)
-FEWEST_PIXELS = 50  # of a class
+FEWEST_PIXELS = 20  # of a class
 FAR_FRAME, MANY_FRAMES = 5.0, 6  # deviations of an odd frame; frames whose scatter is known by themselves
 JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure from which pedestals jump between exposures
 FEWEST_FRAMES = 3  # of an exposure that can be halved
@@ -166,19 +166,25 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
 
 
 def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """The errors of levels [exposure], widened where they leave a straight line over exposure by more: pedestals jump."""
-    if len(set(exposure_s)) < 3:
-        return sigma
+    """The errors of levels [exposure], widened where they leave a straight line over exposure that does not fall.
+
+    Pedestals jump between exposures then.
+    """
     weight = 1 / np.maximum(sigma, 1e-6)
     design = np.stack([np.ones_like(exposure_s), exposure_s], 1) * weight[:, None]
-    theta, *_ = np.linalg.lstsq(design, level * weight, rcond=None)
-    chi2 = float((((level * weight) - design @ theta) ** 2).sum()) / (len(level) - 2)
-    return sigma * (np.sqrt(chi2) if chi2 > JUMPS else 1.0)
+    for columns in (design, design[:, :1]):
+        theta, *_ = np.linalg.lstsq(columns, level * weight, rcond=None)
+        if theta[-1] >= 0:
+            break
+    dof = len(set(exposure_s)) - len(theta)
+    chi2 = float((((level * weight) - columns @ theta) ** 2).sum()) / max(dof, 1)
+    return sigma * (np.sqrt(chi2) if dof > 0 and chi2 > JUMPS else 1.0)
 
 
 def _edges(growth: np.ndarray, limit: float, of_body: bool) -> np.ndarray:
     """Lower edges of the classes: quantiles, and the limit of hot pixels, which no class crosses."""
-    edges = np.quantile(growth, (BODY if of_body else BODY[:1]) + TAIL)
+    tail = tuple(q for q in TAIL if len(growth) * (1 - q) > 2 * FEWEST_PIXELS)
+    edges = np.quantile(growth, (BODY if of_body else BODY[:1]) + tail)
     if not of_body:
         edges = np.append(edges[:1], edges[1:][edges[1:] > limit])
     if growth.max() > limit:

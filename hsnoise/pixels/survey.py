@@ -10,16 +10,21 @@ import numpy as np
 
 from hsnoise._types import cfa_tile
 from hsnoise.decomposition import COMPONENTS, Component, PlaneSums
+from hsnoise.narrow_noise import narrow_read_noise
 from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
 from hsnoise.stack import FrameStack
 
 NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
+NARROW_DN2 = 0.25  # temporal variance below which rounding is no noise of 1/12 DN^2
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One colour plane of one exposure: its place in the colour pattern, components, means, and sampled pixels."""
+    """One colour plane of one exposure: its channel, means, components, and sampled pixels.
+
+    narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
+    """
 
     channel: int
     row_mean_dn: np.ndarray
@@ -28,6 +33,7 @@ class Plane:
     row_frame_dn: np.ndarray
     components: dict[str, Component]
     halves: Halves | None
+    narrow_dn: tuple[float, float] | None
 
 
 class OddLines(NamedTuple):
@@ -150,7 +156,15 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         row_frame_dn=row_frame - row_frame.mean(0) - row_frame.mean(1, keepdims=True) + row_frame.mean(),
         components=_with_tails(sums.components(), halves, h * w),
         halves=halves,
+        narrow_dn=_narrow(counts, halves),
     )
+
+
+def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
+    """Estimate and upper bound of noise that is narrower than a count, DN; None of wider noise."""
+    if halves is None or not 0 < float(halves.pair_variance_dn2.mean()) < NARROW_DN2:
+        return None
+    return narrow_read_noise(counts)
 
 
 def _with_tails(found: dict[str, Component], halves: Halves | None, pixels: int) -> dict[str, Component]:
