@@ -106,7 +106,7 @@ STL_DARKS = "bias_m05C|dark_m05C_060s$"
 REAL = (
     Real("STL-1001, bias and 60 s", unpacked(STL, STL_DARKS), (Known("gain", *STL_PAIRS, 0.06),)),
     Real("STL-1001, with flats", unpacked(STL, f"{STL_DARKS}|flat"), (Known("gain", *STL_PAIRS, 0.02),)),
-    Real("STL-1001, everything", unpacked(STL), (Known("gain", *STL_PAIRS, 0.02),), ("°C|temperature",)),
+    Real("STL-1001, everything", unpacked(STL), (Known("gain", *STL_PAIRS, 0.02),), ("°C|Celsius|temperature",)),
     Real("IMX541, darks", unpacked(IMX, "dark"), (Known("gain", np.nan, np.nan),), ("flat",)),
     Real("IMX541, darks and flats", unpacked(IMX), (Known("gain", 0.4221, 0.4221, 0.02),)),
     Real("sbig_st8_cc0", copied("sbig_st8_cc0"), (Known("gain", *ST8_PAIRS, 0.02),), ("binn|size|pixels",)),
