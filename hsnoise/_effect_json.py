@@ -27,10 +27,11 @@ def effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]],
             f"effect {name!r} is not built into hsnoise; pass its class: NoiseModel.load(path, effects=[MyEffect])."
         )
     specs = classes[name].specs()
-    if set(item["parameters"]) != set(specs):
+    given, needed = set(item["parameters"]), set(specs) - classes[name].with_default()
+    if not needed <= given <= set(specs):  # a file may be older than a parameter that has a default
         raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(item['parameters'])}.")
     values = {}
-    for field, spec in specs.items():
+    for field, spec in ((field, spec) for field, spec in specs.items() if field in given):
         value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,8 +50,9 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
             shutter, kind, ...) an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays
             [frame, row, column], one an exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
-            not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
-            together with all others (`hsnoise.synthetic`); their values are where the search starts.
+            not used, but for `row_gain.white_share`: 0 and 1 are held, and any other is where the search for it starts.
+            Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
+            statistics, together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "auto" is
             "ml", and if that does not converge, "line", which the result then says. With effects beyond the paper's
             it is that of the fit which the simulated statistics start from.
@@ -80,6 +83,9 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
     with_clamp = model is not None and "black_clamp" in model
     if with_clamp:
         _check_clamp(summary, method)
+    white_share = _white_share(model)
+    if white_share is not None and method == "line":
+        raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
             "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
@@ -88,6 +94,9 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         start = start_physics(summary, with_row_gain, with_clamp)
         if model is not None and "dark_current" not in model:
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
+        if white_share is not None:
+            exponent = start.exponent if white_share < 1 else np.asarray(0.0)
+            start = replace(start, white_share=white_share, exponent=exponent)
         if method == "line":
             return _by_line(summary, model, "the paper's line fit, as asked")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
@@ -100,7 +109,7 @@ def fit(stack, *, model: NoiseModel | None = None, method: str = "auto", progres
         if converged:
             return result
         why = result.outcome.removeprefix(NOT_CONVERGED)
-        if method == "ml" or with_clamp:
+        if method == "ml" or with_clamp or white_share is not None:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
 
@@ -157,6 +166,14 @@ def _check_model(model: NoiseModel) -> bool:
     with jax.enable_x64(True):
         physics_of(model)  # raises for effects without a likelihood
     return "row_gain" in model
+
+
+def _white_share(model: NoiseModel | None) -> np.ndarray | None:
+    """That of a model's row gain; None for 0."""
+    if model is None or "row_gain" not in model:
+        return None
+    share = np.asarray(model["row_gain"].white_share, np.float64)
+    return share if share > 0 else None
 
 
 def _check_clamp(summary: Summary, method: str) -> None:
@@ -257,10 +274,11 @@ def _covariance(information: np.ndarray) -> np.ndarray:
 
 def _model_with(physics: Physics, summary: Summary, model: NoiseModel | None) -> NoiseModel:
     """A NoiseModel of the fitted values; its default exposure is the median one of the darks."""
+    white_share = 0.0 if physics.white_share is None else physics.white_share
     values = {
         "dark_current": lambda: DarkCurrent(physics.dark_current),
         "read_noise": lambda: ReadNoise(physics.read_noise),
-        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent),
+        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent, white_share),
         "gain": lambda: Gain(physics.gain),
         "black_level": lambda: BlackLevel(physics.black_level),
         "black_clamp": lambda: BlackClamp(jnp.maximum(physics.black_clamp, 0.0)),

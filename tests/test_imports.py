@@ -13,7 +13,8 @@ import hsnoise
 
 ROOT = Path(hsnoise.__file__).parent
 # A module may import those before it, and its own package.
-ORDER = """_types _keys _threads _compiling _memory _numerics _poisson _frames _arguments _output stack io effects
+ORDER = """_types _keys _threads _compiling _memory _numerics _poisson _coloured _frames _arguments _output stack io
+    effects
     _effect_json arrivals signal_chain stlstm weights video model mosaic cameras photometry _counting flats statistics
     structure draws rows physics moments plan likelihood coordinates maximise profile result notes lut line_spectrum
     line knobs synthetic fit plots criticism report _options _table _progress _enhance cli __main__""".split()
