@@ -54,7 +54,8 @@ def flat_log_likelihood(law: FlatLaw, flats: FlatMoments) -> jax.Array:
     variance = flat_variance(law, flats)
     total = _gamma_log_density(flats.variance_dn2, flats.weight, variance).sum()
     signal = jnp.maximum(jnp.asarray(flats.mean_dn) - law.black_dn, LEAST_SIGNAL_DN)
-    row_power = law.row_variance[None, :] * signal**2 + variance / jnp.asarray(flats.row_pixels)
+    # Of the variance that was measured: neighbours that are correlated would pull the gain through their rows.
+    row_power = law.row_variance[None, :] * signal**2 + jnp.asarray(flats.variance_dn2 / flats.row_pixels)
     total += jnp.where(used, _gamma_log_density(flats.row_power_dn2, flats.row_dof, row_power), 0.0).sum()
     if flats.photons_e is not None:
         photons = jnp.nan_to_num(jnp.asarray(flats.photons_e))[:, None]

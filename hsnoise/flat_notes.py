@@ -102,6 +102,6 @@ def stated_gain_note(stated_dn_per_e: float, source: str, gain: float, error: fl
     if abs(off) < WRONG or abs(stated_dn_per_e - gain) < WRONG_SIGMAS * error:
         return []
     return [
-        f"{source} states {1 / stated_dn_per_e:.3g} e-/DN, but these frames say {1 / gain:.4g} e-/DN"
+        f"{source} states {1 / stated_dn_per_e:.3g} e-/DN, but these frames say {1 / gain:.3g} e-/DN"
         f" ({gain:.4g} DN/e-): the header's value is wrong or nominal."
     ]

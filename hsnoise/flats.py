@@ -24,11 +24,14 @@ from hsnoise.stack import FrameStack
 FLICKER = 0.5  # of the mean: more is another light
 OUTLIERS = 1e-7  # chance that a pixel is taken for one hit by a cosmic ray
 CLEAR_SIGMAS = 5.0  # of a pixel's mean from where it is clipped
+DARK_CLEAR_SIGMAS = 3.0  # likewise, of darks: a thousandth of them clipped changes their variance by 1 %
 PILED_UP = 1e-3  # of the pixels on the highest count: it is where they saturate
 FEWEST_PILED = 10  # likewise
 FEWEST_PIXELS = 0.5  # of a level, after those that saturate
+CLEAR_DARKS = 0.98  # of darks, else they clip
 SAME_EXPOSURE = 0.01
-SAMPLE_PIXELS = 500_000  # for a typical variance
+SAMPLE_PIXELS = 100_000  # for what is typical
+OUTER = 1e-3  # of the pixels on each side
 NARROW_DN2 = 0.25  # of variance: below, many pixels hold the highest count
 MOST_DARKS = 16  # frames that a level of darks is measured on
 
@@ -173,7 +176,7 @@ def _dark_levels(stack: FrameStack) -> list[tuple[float, Measured]]:
     for i in wanted:
         shots = [Shot(i, n) for n in range(min(stack.n_frames[i], MOST_DARKS))]
         level = _measure(stack, shots, {}, None, lambda: None)
-        if (level.kept > 1 - PILED_UP).all():
+        if (level.kept > CLEAR_DARKS).all():
             out.append((float(stack.exposure_s[i]), level))
     return out
 
@@ -215,15 +218,24 @@ def _sums(frame: np.ndarray, cfa: str, channels: tuple[str, ...], black: np.ndar
         y = channel_rows(frame, cfa, c)
         low, high = float(y.min()), float(y.max())
         at_highest = int((y == high).sum())
-        row_means = y.mean(1, dtype=np.float64)
+        within = _within_reach(y)
+        row_means = within.mean(1, dtype=np.float64)
         zero = row_means.mean() if black is None else black[n]
         light = 1.0 if black is None else float(row_means.mean() - zero)
-        y = (y - np.float32(zero)) / np.float32(light if light > 0 else np.inf)
-        rows = y.mean(1, dtype=np.float64)
-        columns = y.mean(0, dtype=np.float64) - rows.mean()
+        scale = 1 / light if light > 0 else 0.0
+        y = (y - np.float32(zero)) * np.float32(scale)
+        rows = (row_means - zero) * scale
+        columns = (within.mean(0, dtype=np.float64) - row_means.mean()) * scale
         left = y - rows[:, None].astype(np.float32) - columns[None].astype(np.float32)
         out[c] = _Sums(y, left * left, rows, columns, row_means[None], np.array([light]), low, high, at_highest)
     return out
+
+
+def _within_reach(y: np.ndarray) -> np.ndarray:
+    """Counts, those far outside all others moved to where the others end: one cosmic ray moves the mean of its row."""
+    low, high = np.quantile(y.ravel()[:: max(y.size // SAMPLE_PIXELS, 1)], (OUTER, 1 - OUTER))
+    margin = max((high - low) / 2, 1.0)
+    return np.clip(y, low - margin, high + margin)
 
 
 def _added(a: dict[str, _Sums], b: dict[str, _Sums]) -> dict[str, _Sums]:
@@ -329,6 +341,6 @@ def _unclipped(sums: _Sums, level: np.ndarray, variance: float, white_level: flo
     many = max(PILED_UP * level.size * len(sums.light), FEWEST_PILED)
     if not is_dark and variance > NARROW_DN2 and sums.at_highest > many:
         white = min(white, sums.highest)
-    reach = CLEAR_SIGMAS * np.sqrt(variance)
+    reach = (DARK_CLEAR_SIGMAS if is_dark else CLEAR_SIGMAS) * np.sqrt(variance)
     clear = level + reach < white if sums.highest >= white else np.ones(level.shape, bool)
     return clear & (level - reach > 0) if sums.lowest <= 0 else clear
