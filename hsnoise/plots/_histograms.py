@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, seconds, tidy, title_of
+from hsnoise._types import seconds
+from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms
 
 MOST_BINS = 90  # that can be told apart in a panel

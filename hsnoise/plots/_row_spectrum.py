@@ -8,9 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hsnoise import rows
+from hsnoise._types import seconds
 from hsnoise.physics import Physics
 from hsnoise.plots._moments import beta_rule, count_moments
-from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, seconds, tidy, title_of
+from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3

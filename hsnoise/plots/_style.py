@@ -35,11 +35,3 @@ def tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9)
-
-
-def seconds(exposure_s: float) -> str:
-    """An exposure for a label: 25 us, 50 ms, 1.5 s."""
-    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
-        if exposure_s * factor >= 1:
-            return f"{exposure_s * factor:.4g} {unit}"
-    return f"{exposure_s:g} s"
