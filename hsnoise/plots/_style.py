@@ -13,6 +13,7 @@ COLOURS = {"R": "#D55E00", "G": "#009E73", "B": "#0072B2", "mono": "#404040"}
 MARKERS = {"R": "o", "G": "s", "B": "^", "mono": "o"}
 NAMES = {"R": "red", "G": "green", "B": "blue", "mono": "all pixels"}
 FIT = "black"
+HOT = "#E69F00"  # hot pixels, beside a colour's own
 DPI = 110
 
 
