@@ -23,7 +23,8 @@ def histograms(fit) -> Figure:
     Logarithmic, so that the tails show. Residuals are in standard deviations of a measured bin, estimated from its
     scatter between frames (between rows if there is one frame): all pixels of a row share a gain, so that
     a bin scatters more than its square root. The outermost bins hold all that lies beyond. Of many exposures
-    six are shown. Where pixels differ, the model's counts are sampled instead: no one distribution holds for all pixels.
+    six are shown. Where pixels differ, no one distribution holds for all
+    of them: counts are then sampled from the model.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.

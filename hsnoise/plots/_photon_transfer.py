@@ -72,8 +72,7 @@ def _panels(fit) -> list[Callable[[Axes], None]]:
 
 
 def _classes(axes: Axes, fit) -> None:
-    for name, transfer in transfers_of(fit):
-        draw_variances(axes, name, transfer)
+    draw_variances(axes, transfers_of(fit))
     axes.set_title("dark frames, classes of pixels over time", fontsize=10)
     axes.set_ylabel("temporal variance / DN²")
     axes.set_xlabel("dark signal / DN")

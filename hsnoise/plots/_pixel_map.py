@@ -32,8 +32,8 @@ def pixel_map(fit) -> Figure:
     found = {name: np.argwhere(flags & bit > 0) for name, bit in FLAGS.items()}
     many = [name for name, places in found.items() if len(places) > MOST_DOTS]
     width = 7.0 * max(len(many), 1)
-    height = float(np.clip(6.3 * rows / columns, 1.5, 7.0)) + (2.6 if many else 1.7)
-    figure = new_figure(width, height, f"Pixels set apart, of {rows} x {columns}")
+    height = float(np.clip(6.8 * rows / columns, 1.7, 7.5)) + (2.1 if many else 1.3)
+    figure = new_figure(width, height, f"Pixels set apart, of {rows} rows x {columns} columns")
     panels = figure.subplots(1, max(len(many), 1), squeeze=False, sharex=True, sharey=True)[0]
     for axes, name in zip(panels, many, strict=False):
         _density(figure, axes, name, found[name], (rows, columns))
@@ -50,7 +50,7 @@ def pixel_map(fit) -> Figure:
         tidy(axes)
         axes.grid(False)
     panels[0].set_ylabel("row")
-    _legend(figure, found, many, flags.size)
+    _legend(figure, found, many, flags.size, fit.summary.flats is not None)
     return figure
 
 
@@ -70,13 +70,18 @@ def _density(figure: Figure, axes: Axes, name: str, places: np.ndarray, shape: t
     axes.set_title(f"{MEANINGS[name]} pixels", fontsize=10)
 
 
-def _legend(figure: Figure, found: dict[str, np.ndarray], many: list[str], pixels: int) -> None:
-    """Shares of all kinds; those that are a density have no marker."""
+def _legend(figure: Figure, found: dict[str, np.ndarray], many: list[str], pixels: int, lit: bool) -> None:
+    """Numbers and shares of all kinds; those that are a density have no marker."""
     handles = []
     for name, places in found.items():
-        share = f"{100 * len(places) / pixels:.2g} %" if len(places) else "none"
-        drawn_as = " (shaded)" if name in many else ""
-        label = f"{MEANINGS[name]}: {len(places):,}, {share}{drawn_as}" if len(places) else f"{MEANINGS[name]}: none"
+        label = (
+            f"{MEANINGS[name]}: {len(places):,}, {100 * len(places) / pixels:.2g} %"
+            if len(places)
+            else f"{MEANINGS[name]}: none"
+        )
+        label += " (shaded)" if name in many else ""
+        if name == "dead" and not lit:
+            label = "dead: flats would show them"
         marker = "" if name in many or not len(places) else MARKERS[name]
         handles += figure.axes[0].plot([], [], marker=marker, linestyle="", color=COLOURS[name], label=label)
     figure.legend(handles=handles, loc="outside lower center", ncols=2 if len(many) < 2 else 4, fontsize=9)

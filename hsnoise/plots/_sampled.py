@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.ticker import NullLocator
 
 from hsnoise._types import cfa_tile, seconds
 from hsnoise.draws import darks_of, draw_capture
 from hsnoise.pixels.classes import growth_noise, levels_of, slope_over
 from hsnoise.pixels.survey import survey
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy
+from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
 from hsnoise.stack import FrameStack
 
 CORE = (5e-4, 0.97)  # quantiles between which bins are equally wide
@@ -20,6 +20,7 @@ FEWEST = 5  # counts in a bin of which a ratio is shown
 MOST_RATIO = 10.0
 RATIOS = (0.1, 0.2, 0.5, 1, 2, 5, 10)
 MOST_EXPOSURES = 6
+WIDE = 3.0  # times the core, from which an axis is bent
 
 
 def drawn_beside(fit) -> tuple[FrameStack, FrameStack]:
@@ -196,15 +197,10 @@ def _ratio(axes: Axes, name: str, measured: np.ndarray, sampled: np.ndarray, edg
 
 
 def wide_axis(axes: Axes, edges: np.ndarray) -> None:
-    """Linear over the core, logarithmic beyond, with plain numbers."""
+    """Linear over the core, logarithmic beyond."""
     widths = np.diff(edges)
     core = edges[:-1][widths < 1.01 * widths.min()]
     near = max(abs(core[0]), abs(core[-1]), 1e-9)
-    if max(abs(edges[0]), abs(edges[-1])) > 3 * near:
-        axes.set_xscale("symlog", linthresh=near, linscale=2.0)
-        decades = 10.0 ** np.arange(np.ceil(np.log10(1.3 * near)), np.floor(np.log10(np.abs(edges).max())) + 1)
-        inner = [x for x in MaxNLocator(nbins=5).tick_values(-near, near) if abs(x) <= near]
-        ticks = [x for x in (*-decades[::-1], *inner, *decades) if edges[0] <= x <= edges[-1]]
-        axes.set_xticks(ticks, [f"{x:,g}" for x in ticks])
-        axes.xaxis.set_minor_locator(NullLocator())
+    if max(abs(edges[0]), abs(edges[-1])) > WIDE * near:
+        bend_axis(axes, 0.5 * near, edges[0], edges[-1])
     axes.set_xlim(edges[0], edges[-1])
