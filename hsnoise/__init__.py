@@ -10,6 +10,7 @@ from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
 from hsnoise.fit import FitResult, fit
+from hsnoise.inspection import inspect
 from hsnoise.io import load
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel, sample, sample_dark
@@ -32,6 +33,7 @@ __all__ = [
     "diagnose",
     "fit",
     "improve",
+    "inspect",
     "load",
     "log_likelihood",
     "param",

@@ -17,7 +17,8 @@ from hsnoise._frames import LazyFrames
 from hsnoise._types import StatedGain, Window, cfa_tile, is_traced
 
 KINDS = ("dark", "flat")
-MOSAIC_SIGMA, MOSAIC_SIZE, LEAST_PIXELS, MOST_PIXELS = 6.0, 0.04, 1024, 1 << 20
+MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
+MOSAIC_MEAN, MOSAIC_VARIANCE = 0.15, 0.04  # of a pixel's noise and variance: taps of a mono CCD leave 0.09, 0.01
 MOSAIC = (
     "read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it is one, give"
     " its Bayer order: cfa='RGGB', say"
@@ -125,10 +126,10 @@ def looks_like_a_mosaic(frame: np.ndarray) -> bool:
     squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2
     variance = max(float(squares.mean()), 1e-12)
     sign = np.array([[1, -1], [-1, 1]])[None, :, None, :]
-    for values, size in ((pixels, np.sqrt(variance)), (squares, variance)):
+    for values, least in ((pixels, MOSAIC_MEAN * np.sqrt(variance)), (squares, MOSAIC_VARIANCE * variance)):
         block = (sign * values).sum((1, 3)).ravel()
         mean, error = abs(float(block.mean())), max(float(block.std()) / np.sqrt(block.size), 1e-12)
-        if mean > MOSAIC_SIGMA * error and mean > MOSAIC_SIZE * 4 * size:
+        if mean > MOSAIC_SIGMA * error and mean > 4 * least:
             return True
     return False
 

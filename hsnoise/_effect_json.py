@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,10 +28,12 @@ def effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]],
             f"effect {name!r} is not built into hsnoise; pass its class: NoiseModel.load(path, effects=[MyEffect])."
         )
     specs = classes[name].specs()
-    if set(item["parameters"]) != set(specs):
-        raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(item['parameters'])}.")
+    optional = {f.name for f in dataclasses.fields(classes[name]) if f.default is not dataclasses.MISSING}
+    given = set(item["parameters"])
+    if given - set(specs) or set(specs) - given - optional:
+        raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(given)}.")
     values = {}
-    for field, spec in specs.items():
+    for field, spec in ((field, spec) for field, spec in specs.items() if field in given):
         value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")

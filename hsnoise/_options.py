@@ -24,6 +24,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"hsnoise {version('hsnoise')}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _demo_arguments(commands)
+    _inspect_arguments(commands)
     _fit_arguments(commands)
     _loop_arguments(commands)
     _sample_arguments(commands)
@@ -46,6 +47,17 @@ def _demo_arguments(commands: Any) -> None:
     )
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
     _capture_arguments(demo)
+
+
+def _inspect_arguments(commands: Any) -> None:
+    text = (
+        "Look at a capture before any fit, in seconds: what its frames are, which are odd, their noise budget, what "
+        "can and what cannot be determined from them, and the next capture worth taking. Exits with 1 where a fit "
+        "makes no sense."
+    )
+    inspect = commands.add_parser("inspect", help="see what frames are and what they can tell", description=text)
+    inspect.add_argument("paths", nargs="+", metavar="PATH", help="a folder with bias, darks, flats; files; a pattern")
+    _capture_arguments(inspect)
 
 
 def _fit_arguments(commands: Any) -> None:

@@ -1,4 +1,4 @@
-"""The command line: `hsnoise demo`, `fit`, `compare`, `diagnose`, `improve`, `sample` and `enhance`."""
+"""The command line: `hsnoise demo`, `inspect`, `fit`, `compare`, `diagnose`, `improve`, `sample` and `enhance`."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` ele
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
 errors do not say: whether the model is right. {}"""
-LOOK = dict.fromkeys(("ml", "line"), "Look at the residuals in histograms.png, and run {}.")
+LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}.")
 LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, or 2 after an error, which is reported in one sentence."""
+    """Run a command; returns the exit code: 0, 1 if a capture makes no fit, or 2 after an error, told in a sentence."""
     parser = _options.parser()
     args = parser.parse_args(argv)
     if args.command is None:
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
             warnings.showwarning = lambda message, *_, **__: console.print(
                 f"Note: {_with_options(str(message))}.", style="yellow", markup=False
             )
-            RUN[args.command](args)
+            return RUN[args.command](args) or 0
     except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
         if args.debug:
             raise
@@ -80,7 +80,6 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("hsnoise: interrupted", file=sys.stderr)
         return 130
-    return 0
 
 
 def _sentence(error: Exception) -> str:
@@ -131,11 +130,19 @@ def _simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
     return FrameStack(counts, **metadata), truth
 
 
+def _inspect(args: argparse.Namespace) -> int:
+    stack = load_capture(args.paths, args)
+    with busy("Looking at the frames"):
+        found = hsnoise.inspect(stack)
+    print(_with_options(str(found)))
+    return 0 if found.fit_makes_sense else 1
+
+
 def _fit(args: argparse.Namespace) -> None:
     _check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), load_capture(args.paths, args)
     stack.check()
-    console, out = Console(highlight=False), args.out
+    console, out = Console(highlight=False, soft_wrap=True), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
     fit = fit_with_progress(stack, args.method, model)
@@ -284,6 +291,7 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
 
 RUN = {
     "demo": _demo,
+    "inspect": _inspect,
     "fit": _fit,
     "compare": _compare,
     "diagnose": _diagnose,

@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise._arguments import MOSAIC, looks_like_a_mosaic
+from hsnoise.flat_notes import gain_notes
 from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
 from hsnoise.pixels.oddities import oddities_of
-from hsnoise.pixels.structure import can_be_transferred, static_of
+from hsnoise.pixels.structure import can_be_transferred, has_patterns, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
@@ -35,8 +36,10 @@ def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
     What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
     without them.
     """
-    if method == "line" or not (can_be_transferred(found) and _several(found)):
+    if method == "line" or not can_be_transferred(found):
         return False
+    if not _several(found):  # then flats do; a likelihood adds nothing, and rows and columns of a real sensor bend it
+        return summary.flats is not None and has_patterns(found)
     pixel = measure(found, replace(summary, flats=None))
     return not pixel.determined and not _grows(pixel)
 
@@ -91,7 +94,9 @@ def checked(result: FitResult, found: Survey) -> FitResult:
             for sentence in check(result, found)
         )
     )
-    notes = pixel_notes(result) if result.method == "transfer" else result.notes
+    notes = result.notes
+    if result.method == "transfer":
+        notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
     return replace(result, doubts=doubts, notes=notes)
 
 
@@ -106,7 +111,8 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     hot = [c.transfer for c in pixel.channels if c.transfer is not None and np.isfinite(c.transfer.hot_gain)]
     bounds = [t for t in hot if t.hot_gain > 3 * t.hot_error]
     if bounds:
-        low, high = min(t.hot_gain for t in bounds), 2 * max(t.hot_gain for t in bounds)
+        low = max(min(t.hot_gain - 2 * t.hot_error for t in bounds), 0.0)
+        high = 2 * max(t.hot_gain + 2 * t.hot_error for t in bounds)
         why = (
             "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
             f" lies between {low:.3g} and {high:.3g} DN/e-"
@@ -157,6 +163,25 @@ def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
                 f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
                 " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
             )
+
+
+def _of_flats(result: FitResult) -> list[str]:
+    flats = result.transfer.flats
+    return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
+
+
+def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
+    """What read noise is at most, where it is narrower than a count."""
+    darks = [g for g in found.darks if g.n_frames > 1]
+    bounds = [p.narrow_dn[1] for p in min(darks, key=lambda g: g.exposure_s).planes if p.narrow_dn] if darks else []
+    if not bounds or not np.isfinite(max(bounds)):
+        return
+    bound, gain = max(bounds), float(np.mean(np.asarray(result.physics.gain)))
+    electrons = "" if result.withheld else f", {bound / gain:.3g} e-"
+    yield (
+        f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
+        f" {bound:.2g} DN{electrons}. A higher gain setting, or more bits, would show it."
+    )
 
 
 def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:

@@ -43,7 +43,7 @@ class FlatGain(NamedTuple):
     1288's line. standard_error includes the scatter of levels beyond chance. bend, bend_error [channel, 2]: a1 and a2,
     0 if not significant; full_scale_dn: the signal where x is 1. chi2, dof: of the curve, by chance errors.
     used [level, channel]: the levels that gave the gain. level_gain, level_error [level, channel]: variance over
-    signal and its chance error, NaN at levels that say nothing. signal_dn [level, channel].
+    signal and its chance error, NaN without signal. signal_dn [level, channel].
     weight [level, channel]: degrees of freedom with which the levels' variances give this gain with this error.
     """
 
@@ -119,7 +119,8 @@ def flat_gain(flats, black_dn=None, read_variance_dn2=None, read_variance_error_
 def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
     """The fields of FlatGain for one channel."""
     signal = flats.mean_dn[:, c] - black
-    order, levels = _usable(flats, c, signal, read, read_error)
+    excess, error = _excess(flats, c, signal, read, read_error)
+    order, levels = _usable(signal, excess, error, flats.variance_dn2[:, c])
     none, nothing = np.zeros(len(signal), bool), np.full(len(signal), np.nan)
     if not len(order):
         zeros = np.zeros(MOST_DEGREES)
@@ -138,22 +139,26 @@ def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
     degree = len(curve.coefficients) - 1
     bend[:degree] = curve.coefficients[1:] / gain
     bend_error[:degree] = np.sqrt(np.diagonal(curve.covariance)[1 : degree + 1]) * curve.scale / gain
-    used, weight, level_gain, level_error = none, 0 * signal, nothing, nothing.copy()
+    used, weight = none, 0 * signal
     used[order[:n]] = True
-    level_gain[order], level_error[order] = levels.excess / levels.signal, levels.error / levels.signal
+    lit = np.where(signal > 0, signal, np.nan)
     # With `weight` degrees of freedom a level adds weight / 2 (K S / V)^2 to the information on log K.
     variance = flats.variance_dn2[order[:n], c]
     above = variance / (variance - read[order[:n]])
     weight[order[:n]] = 2 * (above * gain / standard_error) ** 2 * share / share.sum()
     fit = gain, standard_error, bend, bend_error, full_scale, curve.chi2, curve.dof, curve.described
-    return *fit, used, level_gain, level_error, signal, weight
+    return *fit, used, excess / lit, error / lit, signal, weight
 
 
-def _usable(flats: FlatMoments, c: int, signal, read, read_error) -> tuple[np.ndarray, _Levels]:
-    """Places of the levels below saturation whose variance says something, by rising signal, and what it is."""
+def _excess(flats: FlatMoments, c: int, signal, read, read_error) -> tuple[np.ndarray, np.ndarray]:
+    """Variance above that of the darks at a row gain of 1 [level], DN^2, and its chance error."""
     variance = flats.variance_dn2[:, c]
     excess = (variance - read) / (1 + row_gain_variance(flats, signal, c))
-    error = np.hypot(variance * np.sqrt(2 / flats.dof[:, c]), read_error)
+    return excess, np.hypot(variance * np.sqrt(2 / flats.dof[:, c]), read_error)
+
+
+def _usable(signal, excess, error, variance) -> tuple[np.ndarray, _Levels]:
+    """Places of the levels below saturation whose variance says something, by rising signal, and what it is."""
     lit = (signal > 0) & (excess > LEAST_SIGMAS * error) & (variance > NARROW_DN2)
     order = np.flatnonzero(lit)[np.argsort(signal[lit], kind="stable")]
     order = order[: _saturation(excess[order]) + 1] if len(order) else order

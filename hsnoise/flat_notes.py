@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hsnoise._types import StatedGain
 from hsnoise.flat_gain import LINE_RANGE, FlatGain, variance_curve
 from hsnoise.flats import FlatMoments
 from hsnoise.physics import flat_gain_of
@@ -96,12 +97,14 @@ def _falling_black(found: FlatGain, flats: FlatMoments) -> list[str]:
     ]
 
 
-def stated_gain_note(stated_dn_per_e: float, source: str, gain: float, error: float) -> list[str]:
-    """That a gain stated by a header is not the sensor's, DN/e-; nothing where they agree."""
-    off = stated_dn_per_e / gain - 1
-    if abs(off) < WRONG or abs(stated_dn_per_e - gain) < WRONG_SIGMAS * error:
+def stated_gain_note(stated: StatedGain | None, gain_dn_per_e: float, error: float) -> list[str]:
+    """That a gain which headers state is not the sensor's; nothing where they agree or state none."""
+    if stated is None or not np.isfinite(gain_dn_per_e):
+        return []
+    off = stated.value_dn_per_e - gain_dn_per_e
+    if abs(off) < max(WRONG * gain_dn_per_e, WRONG_SIGMAS * error):
         return []
     return [
-        f"{source} states {1 / stated_dn_per_e:.3g} e-/DN, but these frames say {1 / gain:.3g} e-/DN"
-        f" ({gain:.4g} DN/e-): the header's value is wrong or nominal."
+        f"The header states {stated.source}, but these frames say {1 / gain_dn_per_e:.3g} e-/DN"
+        f" ({gain_dn_per_e:.4g} DN/e-): the header's value is wrong or nominal."
     ]

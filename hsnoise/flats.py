@@ -215,7 +215,7 @@ def _sums(frame: np.ndarray, cfa: str, channels: tuple[str, ...], black: np.ndar
     """The sums of one frame; darks (black None) are not divided by their light."""
     out = {}
     for n, c in enumerate(channels):
-        y = channel_rows(frame, cfa, c)
+        y = channel_rows(frame, cfa, c).astype(np.float32)
         low, high = float(y.min()), float(y.max())
         at_highest = int((y == high).sum())
         within = _within_reach(y)
@@ -223,11 +223,14 @@ def _sums(frame: np.ndarray, cfa: str, channels: tuple[str, ...], black: np.ndar
         zero = row_means.mean() if black is None else black[n]
         light = 1.0 if black is None else float(row_means.mean() - zero)
         scale = 1 / light if light > 0 else 0.0
-        y = (y - np.float32(zero)) * np.float32(scale)
+        y -= np.float32(zero)
+        y *= np.float32(scale)
         rows = (row_means - zero) * scale
         columns = (within.mean(0, dtype=np.float64) - row_means.mean()) * scale
-        left = y - rows[:, None].astype(np.float32) - columns[None].astype(np.float32)
-        out[c] = _Sums(y, left * left, rows, columns, row_means[None], np.array([light]), low, high, at_highest)
+        left = y - rows[:, None].astype(np.float32)
+        left -= columns.astype(np.float32)
+        np.square(left, out=left)
+        out[c] = _Sums(y, left, rows, columns, row_means[None], np.array([light]), low, high, at_highest)
     return out
 
 
@@ -235,7 +238,7 @@ def _within_reach(y: np.ndarray) -> np.ndarray:
     """Counts, those far outside all others moved to where the others end: one cosmic ray moves the mean of its row."""
     low, high = np.quantile(y.ravel()[:: max(y.size // SAMPLE_PIXELS, 1)], (OUTER, 1 - OUTER))
     margin = max((high - low) / 2, 1.0)
-    return np.clip(y, low - margin, high + margin)
+    return np.clip(y, np.float32(low - margin), np.float32(high + margin))
 
 
 def _added(a: dict[str, _Sums], b: dict[str, _Sums]) -> dict[str, _Sums]:

@@ -97,8 +97,11 @@ class NoiseModel(eqx.Module):
         return iter(self.effects)
 
     def add(self, effect: AbstractEffect) -> NoiseModel:
-        """The model with one effect more. Raises ValueError if it has one of that name."""
-        return self._with((*self.effects, effect))
+        """The model with one effect more, or with this one in place of its own of that class.
+
+        Raises ValueError if it has one of that name of another class.
+        """
+        return self._with((*(own for own in self.effects if type(own) is not type(effect)), effect))
 
     def remove(self, name: str) -> NoiseModel:
         """The model without the effect called `name`. Raises KeyError if it has none."""

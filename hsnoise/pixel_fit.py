@@ -8,6 +8,7 @@ docs/likelihood.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,12 +16,19 @@ import numpy as np
 from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
-from hsnoise.pixels.population import Population, population_of
-from hsnoise.pixels.structure import double_differences, plane_rows
+from hsnoise.pixels.population import Population, offset_sigma, population_of
+from hsnoise.pixels.structure import double_differences, low_side_sigma, plane_rows
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 from hsnoise.statistics import Summary
 
+PATTERNS = {
+    "frame": "frame_offset",
+    "row": "row_fixed_pattern",
+    "column": "column_fixed_pattern",
+    "row_x_frame": "row_noise",
+    "column_x_frame": "column_noise",
+}
 DETERMINED = 0.35  # relative standard error up to which a gain is a number
 ROW_GAIN_THERE = 3.0
 ROUNDS = 30
@@ -38,15 +46,20 @@ class Channel:
             known has an error of UNKNOWN.
         black_dn: level without signal and its error.
         row_gain: variance of the gain of rows and its error.
+        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its error.
+        temporal_dn2: variance of the pixels themselves.
     """
 
     name: str
     transfer: Transfer | None
     population: Population | None
+    offset_dn: tuple[float, float]
     values: np.ndarray
     covariance: np.ndarray
     black_dn: tuple[float, float]
     row_gain: tuple[float, float]
+    patterns: Mapping[str, tuple[float, float]]
+    temporal_dn2: float
 
 
 @dataclass(frozen=True)
@@ -66,11 +79,8 @@ class PixelFit:
 def measure(found: Survey, summary: Summary) -> PixelFit:
     """Pixel transfer, flats and population of all channels, and the joint estimate."""
     channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
-    flats = None
-    if summary.flats is not None:
-        black = np.array([one.black_dn[0] for one in channels])
-        floor, error = (np.array([f(one) for one in channels]) for f in (_floor, _floor_error))
-        flats = flat_gain(summary.flats, black, floor, error)
+    flats = None if summary.flats is None else flat_gain(summary.flats)
+    if flats is not None and np.isfinite(flats.gain).all():
         channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
     estimate, covariance = _joint(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
@@ -78,19 +88,13 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
 
 
-def _floor(one: Channel) -> float:
-    return float(one.values[1])
-
-
-def _floor_error(one: Channel) -> float:
-    return float(np.sqrt(one.covariance[1, 1]))
-
-
 def _channel(found: Survey, c: int, name: str) -> Channel:
     pixels = levels_of(found, c)
-    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
     (growth, growth_error), black = _growth_of_means(found, c)
-    floor, floor_error = _temporal(found, c)
+    narrow = _narrow(found, c)
+    floor, floor_error = _temporal(found, c) if narrow is None else _of_narrow(narrow)
+    pixels = pixels if narrow is None else None  # rounding, not light, sets the variance of narrow noise
+    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if transfer is not None and pixels is not None:
@@ -101,7 +105,57 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             # Where ordinary pixels do not grow, hot ones give a bound only.
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
-    return Channel(name, transfer, population, values, covariance, black, _row_gain(found, c, values[2]))
+    rows, patterns = _row_gain(found, c, values[2]), _patterns(found, c)
+    offset = population.offset_sigma if population is not None else _offset(found, c)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor)
+
+
+def _offset(found: Survey, c: int) -> tuple[float, float]:
+    """Standard deviation of offsets where exposures do not tell them from dark current."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return 0.0, np.inf
+    pattern, low_side = _pattern(found, c)
+    return offset_sigma(pattern, 0.0, low_side)
+
+
+def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
+    """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
+    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    rows = len(found.sampled_rows) * plane_rows(found)
+    levels = [p.halves.level_dn for p in group.planes if p.channel == c]
+    low_side = float(np.mean([low_side_sigma(one, rows) for one in levels]))
+    return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
+
+
+def _patterns(found: Survey, c: int) -> dict[str, tuple[float, float]]:
+    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return {}
+    planes = [p for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == c]
+    out = {}
+    for component, effect in PATTERNS.items():
+        parts = [p.components[component] for p in planes]
+        error = np.sqrt(sum(one.standard_error_dn2**2 for one in parts)) / len(parts)
+        out[effect] = float(np.mean([one.variance_dn2 for one in parts])), float(error)
+    return out
+
+
+def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
+    """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups:
+        return None
+    shortest = min(groups, key=lambda g: g.exposure_s)
+    return next((p.narrow_dn for p in shortest.planes if p.channel == c), None)
+
+
+def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
+    """Variance with rounding that stands for narrow noise, and its error: the bound is two of them away."""
+    estimate, bound = narrow
+    middle = estimate if np.isfinite(estimate) else bound / 2
+    return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
 def _temporal(found: Survey, c: int) -> tuple[float, float]:
@@ -139,13 +193,8 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
     t = pixels.exposure_s
     slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
-    rows = len(found.sampled_rows) * plane_rows(found)
-    pattern = np.concatenate(
-        [double_differences(p.halves.level_dn, rows) for p in group.planes if p.channel == c], axis=1
-    )
     shift = float(slopes @ transfer.pedestal_dn)
-    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, pattern)
+    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, *_pattern(found, c))
 
 
 def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
@@ -177,6 +226,8 @@ def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> 
 def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
     """Gain [channel], read noise and dark current in electrons, which all colours share, by least squares."""
     n = len(channels)
+    if all(one.covariance[0, 0] >= UNKNOWN**2 for one in channels):
+        return np.append(np.ones(n), [0.0, 0.0]), np.eye(n + 2) * UNKNOWN**2
     data = np.concatenate([_without_rows(one) for one in channels])
     weight = np.zeros((3 * n, 3 * n))
     for c, one in enumerate(channels):

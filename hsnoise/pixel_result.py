@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,35 +14,44 @@ from hsnoise.effects import (
     ADC,
     AbstractEffect,
     BlackLevel,
+    ColumnFixedPattern,
+    ColumnNoise,
     DarkCurrent,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
+    FrameOffset,
     Gain,
     HotPixels,
     ReadNoise,
+    RowFixedPattern,
     RowGain,
+    RowNoise,
     ShotNoise,
 )
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics
-from hsnoise.pixel_fit import ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
+from hsnoise.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
 from hsnoise.pixels.transfer import ROUNDING
 from hsnoise.result import FitResult
 from hsnoise.statistics import Summary
 
+FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
 THERE = 5.0  # standard errors from which an effect of the population is in the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not tell it
 IN_ELECTRONS = ("gain", "dark_current.rate", "read_noise.sigma")
-POPULATION = ("dark_current_nonuniformity", "dark_signal_nonuniformity", "hot_pixels")
+OF_PIXELS = (
+    DarkCurrentNonuniformity,
+    DarkSignalNonuniformity,
+    HotPixels,
+    FrameOffset,
+    RowFixedPattern,
+    ColumnFixedPattern,
+    RowNoise,
+    ColumnNoise,
+)
+POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
+PATTERN_THERE, LEAST_PATTERN = 4.0, 1e-3  # standard errors, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
-
-
-class _Numbers(NamedTuple):
-    """Values and standard errors by name in the table; DN for e- where the gain is not determined."""
-
-    values: dict[str, float]
-    errors: dict[str, float]
-    covariance: dict[tuple[str, str], float]
 
 
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
@@ -83,7 +93,8 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
 
 def _in_electrons(name: str) -> bool:
     """Whether a parameter has no value without the gain."""
-    return name.startswith(IN_ELECTRONS) or name.split(".")[0] in ("hot_pixels", "dark_signal_nonuniformity")
+    effect = name.split(".")[0]
+    return name.startswith(IN_ELECTRONS) or effect in POPULATION and effect != "dark_current_nonuniformity"
 
 
 def _outcome(pixel: PixelFit) -> str:
@@ -108,25 +119,53 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
 def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
     """Effects of the population that are there: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
+    for name in PATTERNS.values():
+        parts = [
+            (*c.patterns.get(name, (0.0, 0.0)), g, c.temporal_dn2) for c, g in zip(pixel.channels, gain, strict=True)
+        ]
+        variance, error = _mean([(v / g**2, e / g**2) for v, e, g, _ in parts])
+        noise = float(np.mean([t / g**2 for _, _, g, t in parts]))
+        if variance > max(PATTERN_THERE * error, LEAST_PATTERN * noise):
+            found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
+    offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
+    if offset[0] > THERE * offset[1]:
+        found["dark_signal_nonuniformity"] = {"sigma": offset}
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
         return found
     spread = _mean(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
-    offset = _mean([(p.offset_sigma[0] / g, p.offset_sigma[1] / g) for p, g in many])
     hot = {
         "fraction": _mean([p.hot_fraction for p, _ in many]),
         "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in many]),
         "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in many]),
     }
+    fano = _fano(pixel)
+    if fano is not None:
+        hot["fano"] = fano
     if spread[0] > 0:
         found["dark_current_nonuniformity"] = {"spread": spread}
-    if offset[0] > THERE * offset[1]:
-        found["dark_signal_nonuniformity"] = {"sigma": offset}
     if hot["fraction"][0] > THERE * hot["fraction"][1] and hot["rate"][0] > 0:
         found["hot_pixels"] = hot
     return found
+
+
+def _fano(pixel: PixelFit) -> tuple[float, float] | None:
+    """Fano factor of the hot pixels, where it is below 1 beyond chance; flats tell it better than ordinary pixels."""
+    told = []
+    for c, channel in enumerate(pixel.channels):
+        t = channel.transfer
+        if t is None or not np.isfinite(t.hot_gain) or not pixel.determined:
+            continue
+        gain, error = pixel.estimate[c], np.sqrt(pixel.covariance[c, c])
+        ratio = t.hot_gain / gain
+        told.append((ratio, ratio * np.hypot(t.hot_error / t.hot_gain, error / gain)))
+    if not told:
+        return None
+    weight = np.array([e**-2 for _, e in told])
+    value, error = float(weight @ [v for v, _ in told] / weight.sum()), float(weight.sum() ** -0.5)
+    return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
 
 
 def _with(pixel: PixelFit, many):
@@ -173,11 +212,12 @@ def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Su
         "adc": lambda: ADC(summary.white_level_dn),
     }
     effects: list[AbstractEffect] = [made[name]() for name in wanted if name in made]
-    classes = {cls.name: cls for cls in (DarkCurrentNonuniformity, DarkSignalNonuniformity, HotPixels)}
+    classes: dict[str, Any] = {cls.name: cls for cls in OF_PIXELS}
     for name in wanted:
         if name in classes:
-            fields = {field: 0.0 for field in classes[name].specs()}
-            fields |= {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
+            fields = {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
+            required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
+            fields = fields or dict.fromkeys(required, 0.0)
             effects.append(classes[name](**fields))
     t = np.sort(summary.exposure_s)
     return NoiseModel(effects, cfa=summary.cfa, shutter=summary.shutter, exposure_s=float(t[len(t) // 2]))

@@ -102,6 +102,8 @@ def _used_bins(histograms: list[RowHistograms]) -> list[RowHistograms]:
     """The same without the bins that no row uses, about half of them: each run of such bins is one."""
     used = [h.counts.any((1, 2)) for h in histograms]
     kept = [u[:, :-1] | u[:, 1:] for u in used]  # edges beside a bin that is used
+    for k in kept:
+        k[:, 0] |= ~k.any(1)  # an exposure with fewer frames than others has none left
     size = round_up(max(int(k.sum(1).max()) for k in kept) + 1, steps=2 if _has_many_rows(histograms[0]) else 1)
     if size >= used[0].shape[1]:
         return histograms

@@ -103,6 +103,22 @@ class FitResult:
         """Whether the fit ended where it should."""
         return not self.outcome.startswith(NOT_CONVERGED)
 
+    def without(self, names: tuple[str, ...]) -> FitResult:
+        """The same fit without some of the effects that it put in by itself; other numbers stay as they are."""
+        params = self.params
+        for name in names:
+            params = params.remove(name)
+        table = params.table()
+        kept = [i for i, name in enumerate(self.names) if name in table]
+        return replace(
+            self,
+            params=params,
+            names=tuple(self.names[i] for i in kept),
+            covariance=self.covariance[np.ix_(kept, kept)],
+            withheld=tuple(name for name in self.withheld if name in table),
+            added=tuple(name for name in self.added if name not in names),
+        )
+
     def with_notes(self, notes: tuple[str, ...]) -> FitResult:
         return replace(self, notes=notes)
 

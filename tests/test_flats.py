@@ -7,6 +7,7 @@ import pytest
 
 import hsnoise
 from hsnoise import FrameStack
+from hsnoise._types import StatedGain
 from hsnoise.flat_gain import flat_gain
 from hsnoise.flat_notes import gain_notes, stated_gain_note
 from hsnoise.flats import flat_moments
@@ -128,10 +129,9 @@ def test_a_bent_response_leaves_gain_and_read_noise_of_the_fit_alone(rng):
 
 
 def test_a_stated_gain_that_is_wrong_is_named():
-    assert stated_gain_note(1 / 2.62, "EGAIN", 0.372, 0.001) == []
-    assert (
-        "GAIN states 1.5 e-/DN, but these frames say 2.29 e-/DN" in stated_gain_note(1 / 1.5, "GAIN", 0.436, 0.001)[0]
-    )
+    right, wrong = StatedGain(1 / 2.62, "EGAIN 2.62 e-/DN", True), StatedGain(1 / 1.5, "GAIN 1.5", False)
+    assert stated_gain_note(right, 0.372, 0.001) == stated_gain_note(None, 0.372, 0.001) == []
+    assert "The header states GAIN 1.5, but these frames say 2.29 e-/DN" in stated_gain_note(wrong, 0.436, 0.001)[0]
 
 
 def fits_of(folder, pattern):

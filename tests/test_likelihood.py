@@ -13,8 +13,10 @@ import hsnoise
 from hsnoise import plan
 from hsnoise._compiling import _lean_options, jit_lean
 from hsnoise.model import sample_dark
+from hsnoise.moments import start_physics
 from hsnoise.physics import evaluate, physics_of
 from hsnoise.plan import plan_rules
+from hsnoise.statistics import some_frames, summarise
 
 EXPOSURE_S = (0.02, 0.1)
 
@@ -243,3 +245,10 @@ def test_programs_of_fits_are_compiled_lean():
     assert _lean_options(), "this version of XLA does not know the option: fits compile twice as long"
     square = jit_lean(lambda x, power: x**power)
     assert square(3.0, 2) == 9.0 and square(jnp.arange(3.0), 2)[2] == 4.0
+
+
+def test_frames_that_only_some_exposures_have_make_a_piece(rng):
+    counts = [np.rint(100 + 5 * rng.standard_normal((n, 16, 16))).astype(np.uint16) for n in (8, 2)]
+    summary = summarise(hsnoise.FrameStack(counts, EXPOSURE_S, shutter="global", black_level=90))
+    (rule,) = plan_rules(start_physics(summary), some_frames(summary, 4, 8))
+    assert np.isfinite(rule.edges_dn).all()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import Diagnosis, diagnose
-from hsnoise.criticism.improve import Step, Story, improve
+from hsnoise.criticism.improve import improve
 from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.story import Step, Story
 
 __all__ = ["Candidate", "Comparison", "Diagnosis", "Step", "Story", "compare", "diagnose", "improve"]

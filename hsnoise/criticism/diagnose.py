@@ -58,6 +58,7 @@ NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
 # Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
 ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
+FEW = 2  # effects that a fit put in, of which one alone may be all that there is
 LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
 
 
@@ -65,6 +66,10 @@ def diagnose(
     fit: FitResult, stack, *, candidates: Any = (), draws: int = DRAWS, seed: int = 0, progress=None, **keywords
 ) -> Diagnosis:
     """Name the physical effect that a fitted model lacks.
+
+    A fit where pixels differ has put in by itself what it measured of them, of rows, columns and frames. If one of
+    these effects explains all that the paper's model lacks, it is the one that is named; else the whole model is asked
+    what it lacks still.
 
     Args:
         fit: result of `hsnoise.fit` on this capture, or one like it (a NoiseModel is taken, too).
@@ -77,6 +82,13 @@ def diagnose(
         TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, is in the model, or
             returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
     """
+    if isinstance(fit, FitResult) and fit.added:
+        options = {**keywords, "candidates": candidates, "draws": draws, "seed": seed, "progress": progress}
+        if len(fit.added) <= FEW:
+            found = diagnose(fit.without(fit.added), stack, **options)
+            if found.best is not None and found.best.name in fit.added:
+                return found
+        return diagnose(replace(fit, added=()), stack, **options)
     tick = callback("progress", progress)
     draws, seed = whole_number("draws", draws, MANY_DETAILS), seed_of("seed", seed)
     stack = as_stack(stack, **keywords)

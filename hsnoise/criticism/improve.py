@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from hsnoise._arguments import callback, counter, seed_of
-from hsnoise._types import unit_in_words
-from hsnoise.criticism.compare import Comparison, compare, nearer
+from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.story import CHANCE_ERROR, FINISHED, Step, Story
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.fit import WITH_LIKELIHOOD, fit, without_likelihood
+from hsnoise.fit import WITH_LIKELIHOOD, fit
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
 
-CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 MOST_STEPS = 8
 MOST_TRIED = 4  # effects, where none explains all
 THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
@@ -35,118 +31,7 @@ WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
 CLEARLY_LESS = 0.95  # of the misfit of all groups together, where that of the worst one grows
 CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
 MOVED_SIGMA = 2.0
-SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is
-FINISHED = "Nothing significant is left"
 UNFINISHED = "Not finished: whether something is missing was being looked for."
-
-
-@dataclass(frozen=True)
-class Step:
-    """One turn of the loop.
-
-    Attributes:
-        fit, comparison, diagnosis: of the model at the start of this step (diagnosis None at the end).
-        added: name of the effect that was added to reach this model; None for the first.
-        held_out: synthetic log-likelihood of the held-out frames, nats; NaN without any.
-        moved: base parameters that changed by more than two standard errors in this step, in words.
-        ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
-    """
-
-    fit: FitResult
-    comparison: Comparison
-    diagnosis: Diagnosis | None
-    added: str | None
-    held_out: float
-    moved: tuple[str, ...]
-    ahead: float = float("nan")
-
-    @property
-    def sizes(self) -> tuple[str, ...]:
-        """What was fitted of the effect that was added, and what was chosen for it, in words."""
-        if self.added is None:
-            return ()
-        open_ = f"{self.added} fits as well on the other side of the gain: these frames do not tell which it is on."
-        return (*_sizes(self.fit, self.added), *([open_] if self.ahead < SIDES_APART else []))
-
-
-@dataclass(frozen=True)
-class Story:
-    """The history of `improve`.
-
-    Attributes:
-        steps: from the first fit to the last that was kept.
-        ended: why it ended, in a sentence.
-        split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
-    """
-
-    steps: tuple[Step, ...]
-    ended: str
-    split: str = ""
-
-    @property
-    def fit(self) -> FitResult:
-        """The last fit that was kept."""
-        return self.steps[-1].fit
-
-    @property
-    def params(self) -> NoiseModel:
-        return self.fit.params
-
-    @property
-    def finished(self) -> bool:
-        """Whether nothing significant was left at the end."""
-        return self.ended.startswith(FINISHED)
-
-    @property
-    def start(self) -> str:
-        """The first model in words: effects beyond the paper's by their names."""
-        return " + ".join(["the paper's model", *without_likelihood(self.steps[0].fit.params)])
-
-    @property
-    def errors(self) -> tuple[float, ...]:
-        """`error` of each step."""
-        return tuple(step.comparison.error for step in self.steps)
-
-    def plot(self):
-        """A figure of the error falling: `hsnoise.plots.story`."""
-        from hsnoise import plots  # matplotlib is slow to import
-
-        return plots.story(self)
-
-    def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=100, color_system=None)
-        table = Table("step", "added", "error", "held-out / nats", "worst group")
-        for i, step in enumerate(self.steps):
-            worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
-            held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
-            name = step.added or self.start
-            table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
-        console.print(table)
-        for i, step in enumerate(self.steps):
-            if step.added:
-                before = self.steps[i - 1]
-                console.print(
-                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
-                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
-                    highlight=False,
-                )
-            for sentence in (*step.sizes, *step.moved):
-                console.print(f"  {sentence}", highlight=False)
-        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
-        for sentence in (self.ended, care, self.split):
-            if sentence:
-                console.print(sentence, highlight=False)
-        return console.file.getvalue().rstrip()
-
-    __repr__ = __str__
-
-
-def together(before: Step, after: Step) -> str:
-    """What fell, in words, where an addition was kept although the error, that of the worst group, did not fall."""
-    if after.comparison.error <= before.comparison.error:
-        return ""
-    sums = [sum(step.comparison.groups.values()) for step in (before, after)]
-    return f", misfit of all groups together {number(sums[0])} -> {number(sums[1])}"
 
 
 def improve(
@@ -174,7 +59,7 @@ def improve(
     _check_start(model, candidates, fitted)
     work, split = _Work(fitted, held_out, seed, say), told_of(fitted, held_out)
     say("Fitting the first model")
-    steps: list[Step] = [work.step(fit(fitted, model=model), None, None)]
+    steps = work.begun(fit(fitted, model=model))
     while True:
         if len(steps) > MOST_STEPS:
             return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.", split)
@@ -209,6 +94,14 @@ class _Work:
         comparison = compare(result.params, self.fitted, seed=self.seed)
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
+
+    def begun(self, first: FitResult) -> list[Step]:
+        """The first steps: the paper's model, then one by one what its fit measured beyond it."""
+        steps = [self.step(first.without(first.added), None, None)]
+        for i, name in enumerate(first.added):
+            self.say(f"Adding {name}, as measured")
+            steps.append(self.step(first.without(first.added[i + 1 :]), name, steps[-1]))
+        return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
 
     def first_that_holds(
         self, candidates: Sequence[Candidate], steps: list[Step]
@@ -258,18 +151,6 @@ class _Work:
         values = [log_likelihood(one.params, self.fitted, self.seed) for one in fits]
         step = self.step(fits[int(np.argmax(values))], candidate.name, steps[-1])
         return replace(step, ahead=abs(values[0] - values[1]))
-
-
-def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
-    rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
-    told = []
-    for label, (value, error, unit) in rows:
-        size, of = rounded(value, error)
-        of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
-        told.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip())
-    chosen = result.params[name].settings().items()
-    told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
-    return tuple(f"{sentence}." for sentence in told)
 
 
 def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
@@ -385,15 +266,3 @@ def _end(found: Diagnosis, comparison: Comparison) -> str:
         return f"Still {found.headline}, but no refit with it held (error {comparison.error:.2f})."
     advice = f": {found.advice}" if found.advice else ""
     return f"Something is left that no effect of the library explains (error {comparison.error:.2f}){advice}."
-
-
-def _because(before: Step, after: Step) -> str:
-    found, reasons = before.diagnosis, nearer(before.comparison, after.comparison)
-    if reasons:
-        reason = reasons[0]
-    else:
-        score = next((one.score for one in found.ranking if one.name == after.added), 0.0) if found else 0.0
-        reason = f"its fingerprint is in the statistics (score {score:.0f} nats)"
-    if found is not None and found.verdict == "unexplained" and after.comparison.error > CHANCE_ERROR:
-        return f"{reason} (no effect explains all that is off; this one comes nearest)"
-    return reason

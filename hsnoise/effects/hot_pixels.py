@@ -7,6 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from hsnoise._keys import named_key
 from hsnoise._types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
 
@@ -18,10 +19,15 @@ class HotPixels(AbstractEffect):
     independently; the rates of hot pixels are exponentially distributed with mean `rate`. They go on while a frame
     waits to be read, for the same time in each: `at_readout` is in proportion to the rate.
 
+    A single generation centre emits a hole, then an electron: where both steps take as long, every second arrival of a
+    Poisson process is an electron, and the variance of many is half of their mean. `fano` is that ratio for large
+    charges: a share 2 (1 - fano) of the charge comes so, the rest is Poisson.
+
     In dark frames: bright dots at fixed places that grow with exposure, each with its own shot noise, and of slow
     sensors fainter in bias frames, too.
 
-    Reference: Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE Trans. Nucl. Sci. 43, 1996.
+    References: Cox, *Renewal Theory*, 1962; Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE
+    Trans. Nucl. Sci. 43, 1996.
     """
 
     name: ClassVar[str] = "hot_pixels"
@@ -32,6 +38,7 @@ class HotPixels(AbstractEffect):
     at_readout: Scalar = param(
         "e-", low=0, default=0.0, held="at bounds", doc="mean extra electrons of a hot pixel whatever the exposure"
     )
+    fano: Scalar = param("1", low=0.5, high=1, default=1.0, held="at bounds", doc="variance over mean of hot charge")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(capture.fixed_key(self.name))
@@ -39,4 +46,12 @@ class HotPixels(AbstractEffect):
         hot = jax.random.uniform(where, shape, signal.dtype) < self.fraction
         strength = jax.random.exponential(how_much, shape, signal.dtype)
         mean = jnp.where(hot, strength * (self.rate * capture.exposure_s + self.at_readout), 0)
-        return signal + draw_poisson(key, mean, signal.shape)
+        in_pairs = 2 * (1 - self.fano)
+        single = draw_poisson(key, (1 - in_pairs) * mean, signal.shape)
+        steps, phase = jax.random.split(named_key(key, "pairs"))
+
+        def second_steps():
+            begun = jax.random.bernoulli(phase, 0.5, signal.shape)
+            return jnp.floor((draw_poisson(steps, 2 * in_pairs * mean, signal.shape) + begun) / 2)
+
+        return signal + single + jax.lax.cond(in_pairs > 0, second_steps, lambda: jnp.zeros_like(signal))

@@ -55,7 +55,7 @@ def stated_gain(header: fits.Header) -> StatedGain | None:
             continue
         says = ELECTRONS_PER_DN.search(header.comments[name]) is not None
         if says or (LEAST_E <= value <= MOST_E and value != 1):
-            return StatedGain(1 / value, f"{name} {value:.4g}{' e-/DN' if says else ', if it is e-/DN'}", certain=False)
+            return StatedGain(1 / value, f"{name} {value:.4g}{' e-/DN' if says else ' (e-/DN?)'}", certain=False)
     return None
 
 

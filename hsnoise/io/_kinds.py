@@ -67,6 +67,8 @@ def _told(recording: Recording, root: Path) -> tuple[str, str | None]:
     """Kind of a file, and in words why, where its header does not say."""
     if recording.kind in CALIBRATION:
         return recording.kind, None
+    if recording.kind not in (None, "light"):
+        raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {recording.kind!r}; give kind=")
     names = names_of(recording.path, root)
     is_light = any(kind_of(name) == "light" for name in names)
     if is_light and recording.kind == "light":

@@ -28,7 +28,7 @@ def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> 
     told: list[str] = []
     too_bright: list[Recording] = []
     for group in groups:
-        if group[0].kind == "dark" or (len(group) == 1 and white_level is None):
+        if group[0].kind == "dark":
             out.append(group)
             continue
         mean_dn, saturated = thinned(group, white_level)
@@ -48,11 +48,13 @@ def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> 
 
 
 def thinned(group: Sequence[Recording], white_level: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Of the first frame of each recording: mean, DN, and whether most pixels are at `white_level`."""
+    """Of the first frame of each recording: mean, DN, and whether most pixels are saturated."""
 
     def of(recording: Recording) -> tuple[float, bool]:
         some = np.asarray(recording.counts[0])[::THIN, ::THIN]
-        return float(some.mean()), white_level is not None and bool(np.mean(some >= white_level) > SATURATED)
+        # A frame of one count throughout is at white, whether the file says where that is or not.
+        white = some.max() if some.min() == some.max() else np.inf if white_level is None else white_level
+        return float(some.mean()), bool(np.mean(some >= white) > SATURATED)
 
     with ThreadPoolExecutor(READERS) as pool:
         means, saturated = zip(*pool.map(of, group), strict=True)

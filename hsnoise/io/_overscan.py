@@ -18,7 +18,6 @@ WIDEST = 0.25  # of the frame: more is no edge
 UNLIT, LIT = 0.3, 0.7  # of the median signal
 BLURRED = 3  # columns at most in between: vignetting falls over more
 LEAST_SIGNAL_DN = 10.0
-NEAR_LIGHT = 3  # columns beside the light, which hold charge left behind, are not averaged
 SOME_FRAMES = 3  # of a group, which tell the mean of its overscan
 
 Overscan = str | tuple[Any, Any] | None
@@ -43,8 +42,8 @@ class Strip:
         return (self.stop, self.size) if self.start == 0 else (0, self.start)
 
     def pixels(self, frame: np.ndarray) -> np.ndarray:
-        """Pixels of the strip in a frame [row, column], but for those beside the light."""
-        margin = NEAR_LIGHT if self.stop - self.start > 2 * NEAR_LIGHT else 0
+        """Pixels of the outer half of the strip in a frame [row, column]: beside the light charge is left behind."""
+        margin = (self.stop - self.start) // 2
         start, stop = (self.start, self.stop - margin) if self.start == 0 else (self.start + margin, self.stop)
         return frame[start:stop] if self.axis == 0 else frame[:, start:stop]
 
@@ -145,10 +144,16 @@ def _given(overscan: Any, shape: tuple[int, int]) -> Strip:
     )
 
 
-def _without(stack: FrameStack, strips: Sequence[Strip]) -> FrameStack:
-    rest = [(0, size) for size in stack.shape]
+def without(shape: tuple[int, int], strips: Sequence[Strip]) -> list[tuple[int, int]]:
+    """Spans of rows and of columns that are left without strips."""
+    rest = [(0, size) for size in shape]
     for one in strips:
         rest[one.axis] = max(rest[one.axis][0], one.rest[0]), min(rest[one.axis][1], one.rest[1])
+    return rest
+
+
+def _without(stack: FrameStack, strips: Sequence[Strip]) -> FrameStack:
+    rows, columns = without(stack.shape, strips)
     told = [f"{str(one).capitalize()} were taken off as overscan" for one in strips]
-    part = stack.select(rows=rest[0], columns=rest[1])
+    part = stack.select(rows=rows, columns=columns)
     return replaced(part, overscan_dn=levels_dn(stack, strips), assumed=(*part.assumed, *told))

@@ -25,8 +25,7 @@ class Recording:
         path: the file.
         counts: DN, `[frame, row, column]`, lazy unless the format forbids it.
         exposure_s, iso, temperature_c: as `FrameStack` has them.
-        kind: "dark", "flat", "bias" (a dark of 0 s unless the file says another exposure), "light", or another word
-            that the file has for it.
+        kind: "dark", "flat", "bias" (a dark of 0 s unless the file says another exposure) or "light".
         cfa: "mono", a Bayer order or `UNKNOWN_ORDER`.
         black_level, white_level: DN; black one value or one a channel.
         shutter: "rolling" or "global".

@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise.pixels.clipping import unclipped
 from hsnoise.pixels.survey import Survey
 
 BODY = (0.0, 0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)  # quantiles between which ordinary pixels are classed
 TAIL = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 0.9999)
-FEWEST_PIXELS = 50  # of a class
+FEWEST_PIXELS = 20  # of a class
 FAR_FRAME, MANY_FRAMES = 5.0, 6  # deviations of an odd frame; frames whose scatter is known by themselves
+JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure from which pedestals jump between exposures
 FEWEST_FRAMES = 3  # of an exposure that can be halved
 OUTLIER_SIGMAS = 6.0  # a half of a pixel's frames with such a deviation holds a cosmic hit, or a telegraph jump
 LEAST_SCALE_DN = 0.5
@@ -84,6 +86,7 @@ def levels_of(found: Survey, channel: int) -> Levels | None:
     )
     whole = np.stack([np.concatenate([h.pair_variance_dn2 for h in of])[moving] for of in halves])
     sigma = _pedestal_sigmas([np.mean([h.frame_means_dn for h in of], axis=0) for of in halves])
+    sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
     return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
 
 
@@ -97,7 +100,11 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         parts = [
             _measured(
                 _members(growth[1 - half], _edges(growth[1 - half], limit, True)),
-                *(x[:, half] for x in (pixels.level, pixels.variance, pixels.peak)),
+                pixels.level[:, half],
+                pixels.variance[:, half],
+                pixels.peak[:, half],
+                pixels.level[:, 1 - half],
+                t,
                 full_scale_dn,
             )
             for half in measuring
@@ -108,7 +115,8 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         mean = growth.mean(0)
         peak = np.sqrt(pixels.whole_variance * (pixels.n_frames[:, None] - 1))
         members = _members(mean, _edges(mean, limit, False))
-        parts = [_measured(members, pixels.level.mean(1), pixels.whole_variance, peak, full_scale_dn)]
+        level = pixels.level.mean(1)
+        parts = [_measured(members, level, pixels.whole_variance, peak, level, t, full_scale_dn)]
         grown = [mean]
     level, variance, error, count, apart = (np.concatenate(x) for x in zip(*[p[:-1] for p in parts], strict=True))
     hot = np.concatenate([[g[m].mean() > limit for m in p[-1]] for g, p in zip(grown, parts, strict=True)])
@@ -159,9 +167,26 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
     return np.array(found)
 
 
+def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """The errors of levels [exposure], widened where they leave a straight line over exposure that does not fall.
+
+    Pedestals jump between exposures then.
+    """
+    weight = 1 / np.maximum(sigma, 1e-6)
+    design = np.stack([np.ones_like(exposure_s), exposure_s], 1) * weight[:, None]
+    for columns in (design, design[:, :1]):
+        theta, *_ = np.linalg.lstsq(columns, level * weight, rcond=None)
+        if theta[-1] >= 0:
+            break
+    dof = len(set(exposure_s)) - len(theta)
+    chi2 = float((((level * weight) - columns @ theta) ** 2).sum()) / max(dof, 1)
+    return sigma * (np.sqrt(chi2) if dof > 0 and chi2 > JUMPS else 1.0)
+
+
 def _edges(growth: np.ndarray, limit: float, of_body: bool) -> np.ndarray:
     """Lower edges of the classes: quantiles, and the limit of hot pixels, which no class crosses."""
-    edges = np.quantile(growth, (BODY if of_body else BODY[:1]) + TAIL)
+    tail = tuple(q for q in TAIL if len(growth) * (1 - q) > 2 * FEWEST_PIXELS)
+    edges = np.quantile(growth, (BODY if of_body else BODY[:1]) + tail)
     if not of_body:
         edges = np.append(edges[:1], edges[1:][edges[1:] > limit])
     if growth.max() > limit:
@@ -177,20 +202,60 @@ def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
     return [inside for inside in np.split(order, bounds) if len(inside) >= FEWEST_PIXELS]
 
 
-def _measured(members: list[np.ndarray], level, variance, peak, full_scale_dn: float):
-    """Level, variance, its error [class, exposure], pixels [class], outliers [class, exposure]; the members."""
+def _measured(members: list[np.ndarray], level, variance, peak, other, t, full_scale_dn: float):
+    """Level, variance, its error [class, exposure], pixels [class], outliers [class, exposure]; the members.
+
+    level, variance, peak [exposure, pixel]: in the frames that measure; other: levels in those that chose.
+    """
     size = (len(members), len(level))
     mean, spread, error, apart = np.zeros(size), np.ones(size), np.full(size, np.inf), np.zeros(size)
+    ordinary = np.median(level, axis=1)
+    scatter = _level_scatter(members, level, other, t)
     for c, inside in enumerate(members):
         for e in range(len(level)):
             v, y = variance[e, inside].astype(np.float64), level[e, inside].astype(np.float64)
-            kept = peak[e, inside] < OUTLIER_SIGMAS * max(np.sqrt(np.median(v)), LEAST_SCALE_DN)
+            kept = peak[e, inside] < OUTLIER_SIGMAS * _expected_scale(v, other[e, inside] - ordinary[e])
             apart[c, e] = len(inside) - kept.sum()
             mean[c, e] = y[kept].mean() if kept.any() else y.mean()
-            if kept.sum() < FEWEST_PIXELS:
+            if kept.sum() < FEWEST_PIXELS or np.quantile(y, 0.999) > FILLED * full_scale_dn:
                 continue
             spread[c, e] = v[kept].mean()
-            low, high = np.quantile(y, (0.001, 0.999))
-            if low > NEAR_ZERO_SIGMAS * np.sqrt(spread[c, e]) and high < FILLED * full_scale_dn and spread[c, e] > 0:
-                error[c, e] = v[kept].std(ddof=1) / np.sqrt(kept.sum())
+            if spread[c, e] <= 0:
+                spread[c, e] = 1.0
+                continue
+            error[c, e] = v[kept].std(ddof=1) / np.sqrt(kept.sum())
+            if np.quantile(y, 0.001) < NEAR_ZERO_SIGMAS * np.sqrt(spread[c, e]):
+                mean[c, e], spread[c, e], growth = unclipped(mean[c, e], spread[c, e], scatter[c, e])
+                error[c, e] *= growth
+    lost = ~np.isfinite(mean)
+    mean[lost], spread[lost] = 0.0, 1.0
     return mean, spread, error, np.array([len(m) for m in members], float), apart, members
+
+
+def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
+    """Temporal deviation that is usual for each pixel of a class [pixel]: brighter ones are noisier.
+
+    excess [pixel]: level above that of ordinary pixels, in other frames.
+    """
+    middle = max(float(np.median(excess)), 1e-6)
+    brighter = np.maximum(excess / middle, 1.0) if middle > LEAST_SCALE_DN else 1.0
+    return np.maximum(np.sqrt(np.median(variance) * brighter), LEAST_SCALE_DN)
+
+
+def _level_scatter(members: list[np.ndarray], level, other, t) -> np.ndarray:
+    """Standard deviation of the levels of the pixels of each class at each exposure [class, exposure], DN.
+
+    Of offsets, as ordinary pixels show them at the brightest exposure, and of the growth that differs within a class.
+    """
+    brightest = int(np.argmax(level.mean(1)))
+    found = np.array([_scatter(level[brightest, m], other[brightest, m]) for m in members])
+    offsets = found[int(np.argmax([len(m) for m in members]))]
+    of_growth = np.maximum(found**2 - offsets**2, 0)
+    share = (t / max(t[brightest], 1e-30)) ** 2
+    return np.sqrt(offsets**2 + of_growth[:, None] * share)
+
+
+def _scatter(one: np.ndarray, other: np.ndarray) -> float:
+    """Standard deviation of the levels of pixels [pixel], from two halves of the frames."""
+    a, b = one.astype(np.float64), other.astype(np.float64)
+    return float(np.sqrt(max(((a - a.mean()) * (b - b.mean())).mean(), 0.0)))

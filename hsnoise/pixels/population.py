@@ -33,7 +33,8 @@ class Population:
     Attributes:
         mean: of ordinary pixels, whatever the limit at which others are called hot.
         spread: of ln dark current of ordinary pixels (0: they do not differ).
-        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current.
+        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current:
+            with it the mean over all pixels is the measured one.
         at_readout: extra charge of hot pixels whatever the exposure, mean, DN.
         offset_sigma: standard deviation of offsets over pixels, rows and columns taken off.
         median, quantiles: of the measured growth, DN/s; quantiles at 1, 16, 84, 99, 99.9 %.
@@ -52,7 +53,7 @@ class Population:
 
 
 def population_of(
-    pixels: Levels, limit: float, ordinary: float, pedestal_dn_per_s: float, pattern: np.ndarray
+    pixels: Levels, limit: float, ordinary: float, pedestal_dn_per_s: float, pattern: np.ndarray, low_side_dn: float
 ) -> Population:
     """The population of one channel.
 
@@ -62,6 +63,7 @@ def population_of(
             taken off.
         pedestal_dn_per_s: what moving pedestals add to every pixel's growth.
         pattern [half, pixel]: offset of each pixel less its row and column, DN, at the shortest exposure.
+        low_side_dn: standard deviation of offsets as pixels below the median show it.
     """
     halves = slope_over(pixels.exposure_s, pixels.level) - pedestal_dn_per_s
     noise = growth_noise(halves) / np.sqrt(2)
@@ -76,6 +78,10 @@ def population_of(
     # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
     cut = _mean_below(limit - pedestal_dn_per_s, noise, values)
     mean = ordinary + (body - cut if spread > 0 or fraction > 0 else 0.0)
+    if fraction > 0:  # whatever the shape of the tail, its charge is kept
+        total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
+        rate = max((total - mean) / fraction, 0.0)
+        errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
     shortest = float(pixels.exposure_s.min())
     return Population(
         mean=mean,
@@ -83,7 +89,7 @@ def population_of(
         hot_fraction=(fraction, errors[2]),
         hot_rate=(rate, errors[3]),
         at_readout=_at_readout(pixels, halves, noise, rate),
-        offset_sigma=_offset_sigma(pattern, spread * body * shortest),
+        offset_sigma=offset_sigma(pattern, spread * body * shortest, low_side_dn),
         median=float(np.median(growth)),
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
@@ -187,12 +193,16 @@ def _errors(loss, theta: np.ndarray) -> np.ndarray:
     return np.sqrt(np.minimum(variance, 1e6))
 
 
-def _offset_sigma(pattern: np.ndarray, dark_sigma_dn: float) -> tuple[float, float]:
-    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off."""
+def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
+    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off.
+
+    At most that of the pixels below the median: warm pixels are no normal offsets.
+    """
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
     a, b = np.clip(pattern, -width, width).astype(np.float64)
     product = (a - a.mean()) * (b - b.mean())
-    variance, error = float(product.mean()) - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
+    both = min(float(product.mean()), low_side_dn**2)
+    variance, error = both - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
     sigma = np.sqrt(max(variance, 0.0))
     return float(sigma), float(min(error / max(2 * sigma, 1e-12), np.sqrt(error)))
 

@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.pixels.classes import HOT_SIGMAS
 from hsnoise.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
 STREAKS = 0.04  # variance of row means over that of pixels from which streaks rule the noise
-CLIPPED = 0.01  # share of clipped counts from which the moments of pixels over time are no longer those of the noise
+CLIPPED = 0.3  # share of clipped counts from which the moments of pixels over time say too little of the noise
 
 
 class Static(NamedTuple):
@@ -57,6 +58,21 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
     return block.reshape(2, -1) / np.float32(2)
 
 
+def low_side_sigma(level: np.ndarray, rows: float) -> float:
+    """Standard deviation of the offsets of pixels [half, pixel] as those below the median show it, DN.
+
+    Warm pixels stand above it only; row and column medians are taken off, the noise of estimation by the two halves.
+    """
+    maps = level.reshape(2, int(rows), -1).astype(np.float64)
+    mean = maps.mean(0)
+    mean = mean - np.median(mean, axis=0, keepdims=True)
+    mean = mean - np.median(mean, axis=1, keepdims=True)
+    apart = (maps[0] - maps[1]) / 2
+    low, middle = np.quantile(mean, (0.1587, 0.5))
+    low_noise, high_noise = np.quantile(apart, (0.1587, 0.8413))
+    return float(np.sqrt(max((middle - low) ** 2 - ((high_noise - low_noise) / 2) ** 2, 0.0)))
+
+
 def covariance_terms(pattern: np.ndarray) -> np.ndarray:
     """Products of two halves [half, place], winsorised, whose mean is the variance of what both share."""
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
@@ -71,12 +87,33 @@ def pixels_differ(found: Survey) -> bool:
             one = static_of(found, group, c)
             if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
                 return True
-        pixels = levels_of(found, c)
-        if pixels is not None:
-            growth = slope_over(pixels.exposure_s, pixels.level)
-            if np.mean(growth.min(0) > hot_from(growth)) > MANY_HOT:
+        if _always_bright(found, c) > MANY_HOT:
+            return True
+    return False
+
+
+def has_patterns(found: Survey) -> bool:
+    """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
+    groups = [g for g in found.darks if g.n_frames > 1]
+    for plane in min(groups, key=lambda g: g.exposure_s).planes if groups else ():
+        noise = plane.components["temporal"].variance_dn2
+        for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
+            one = plane.components[name]
+            if one.variance_dn2 > max(SIGNIFICANT * one.standard_error_dn2, SMALL_PATTERN * noise):
                 return True
     return False
+
+
+def _always_bright(found: Survey, channel: int) -> float:
+    """Share of pixels that stand out in every frame of the longest exposure: hits and jumps do not."""
+    several = [g for g in found.darks if g.n_frames > 1]
+    if not several:
+        return 0.0
+    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).planes if p.channel == channel]
+    lowest = np.concatenate([h.lowest for h in halves]).astype(np.float64)
+    sigma = float(np.sqrt(np.median(np.concatenate([h.pair_variance_dn2 for h in halves]))))
+    level = float(np.median(np.concatenate([h.level_dn for h in halves], 1)))
+    return float(np.mean((lowest > level + HOT_SIGMAS * max(sigma, 0.5))[~found.stuck(channel)]))
 
 
 def can_be_transferred(found: Survey) -> bool:

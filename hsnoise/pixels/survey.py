@@ -10,16 +10,21 @@ import numpy as np
 
 from hsnoise._types import cfa_tile
 from hsnoise.decomposition import COMPONENTS, Component, PlaneSums
+from hsnoise.narrow_noise import narrow_read_noise
 from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
 from hsnoise.stack import FrameStack
 
 NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
+NARROW_DN2 = 0.25  # temporal variance below which rounding is no noise of 1/12 DN^2
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One colour plane of one exposure: its place in the colour pattern, components, means, and sampled pixels."""
+    """One colour plane of one exposure: its channel, means, components, and sampled pixels.
+
+    narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
+    """
 
     channel: int
     row_mean_dn: np.ndarray
@@ -28,6 +33,7 @@ class Plane:
     row_frame_dn: np.ndarray
     components: dict[str, Component]
     halves: Halves | None
+    narrow_dn: tuple[float, float] | None
 
 
 class OddLines(NamedTuple):
@@ -74,7 +80,7 @@ class Survey:
         """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
         halves = [[p.halves for p in g.planes if p.channel == channel] for g in self.groups if g.n_frames > 1]
         still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
-        noisy = [np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2 for of in halves]
+        noisy = [bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves]
         frames = sum(sum(of[0].n_frames) for of, loud in zip(halves, noisy, strict=True) if loud)
         if frames < FEWEST_STILL:  # few may agree by chance
             return np.zeros(len(still[0]) if still else 0, bool)
@@ -150,7 +156,15 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         row_frame_dn=row_frame - row_frame.mean(0) - row_frame.mean(1, keepdims=True) + row_frame.mean(),
         components=_with_tails(sums.components(), halves, sums.shape),
         halves=halves,
+        narrow_dn=_narrow(counts, halves),
     )
+
+
+def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
+    """Estimate and upper bound of noise that is narrower than a count, DN; None of wider noise."""
+    if halves is None or not 0 < float(halves.pair_variance_dn2.mean()) < NARROW_DN2:
+        return None
+    return narrow_read_noise(counts)
 
 
 def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple[int, int]) -> dict[str, Component]:

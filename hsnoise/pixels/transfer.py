@@ -25,7 +25,8 @@ import numpy as np
 from hsnoise.pixels.classes import Classes
 
 ROUNDS = 12
-ALIKE = 0.03  # of the variance without signal: how far classes of pixels differ in it
+ALIKE = (0.03, 0.1, 0.3, 1.0)  # of the variance without signal: how far classes of pixels may differ in it
+OFF_LINE, NEARER = 1.3, 0.9  # chi2 per degree of freedom from which, and share to which, it must fall
 LOOSE_DN = 1e4  # deviation of a pedestal of which nothing is known
 MOVED = 3.5  # standard errors from which a pedestal has moved, whatever its frames say
 FANO = np.concatenate([[1.0], np.linspace(0.5, 1.0, 101)])
@@ -111,17 +112,24 @@ class _Line:
 
 def pixel_transfer(classes: Classes) -> Transfer | None:
     """The gain of one channel; None where too few classes can be measured."""
-    sigma = classes.pedestal_sigma_dn.copy()
-    free, line = _line(classes, np.full(len(sigma), LOOSE_DN)), _line(classes, sigma)
-    if free is None or line is None:
+    sigma, loose = classes.pedestal_sigma_dn.copy(), np.full(len(classes.exposure_s), LOOSE_DN)
+    free = _line(classes, loose, ALIKE[0])
+    if free is None:
         return None
+    alike = ALIKE[0]
+    for wider in ALIKE[1:]:  # pixels differ in read noise, too: as far as that brings them nearer to the line
+        other = _line(classes, loose, wider)
+        if free.chi2 < OFF_LINE * free.dof or other.chi2 > NEARER * free.chi2:
+            break
+        free, alike = other, wider
+    line = _line(classes, sigma, alike)
     moved = np.zeros(len(sigma), bool)
     chance = max(free.chi2 / free.dof, 1.0)
     while line.off - free.off > MOVED**2 * chance and not moved.all():
         shift = line.theta[line.places.pedestal(np.arange(len(sigma)))]
         worst = int(np.argmax(np.where(moved, -1.0, np.abs(shift) / np.maximum(sigma, 1e-9))))
         moved[worst], sigma[worst] = True, LOOSE_DN
-        line = _line(classes, sigma)
+        line = _line(classes, sigma, alike)
     return _told(classes, line, moved)
 
 
@@ -140,7 +148,7 @@ def _signals(classes: Classes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return signal, hot, np.where(classes.hot, np.abs(offset - weight @ offset), 0.0)
 
 
-def _line(classes: Classes, sigma_dn: np.ndarray) -> _Line | None:
+def _line(classes: Classes, sigma_dn: np.ndarray, alike: float) -> _Line | None:
     use = np.isfinite(classes.error_dn2)
     use &= use.sum(1, keepdims=True) > 1
     has_hot, has_ordinary = (bool((of & use.any(1)).any()) for of in (classes.hot, ~classes.hot))
@@ -161,7 +169,7 @@ def _line(classes: Classes, sigma_dn: np.ndarray) -> _Line | None:
     for _ in range(ROUNDS):
         weight = 1 / (relative * expected)
         deviation = np.full(places.number, np.inf)
-        deviation[places.own(np.arange(len(use)))] = np.hypot(ALIKE * floor, abs(gain) * offset)
+        deviation[places.own(np.arange(len(use)))] = np.hypot(alike * floor, abs(gain) * offset)
         deviation[places.pedestal(np.arange(use.shape[1]))] = max(abs(gain), 1e-6) * np.maximum(sigma_dn, 1e-6)
         if not has_hot:
             deviation[places.hot_gain] = 1.0

@@ -12,7 +12,7 @@ import numpy as np
 from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.compare import nearer
-from hsnoise.criticism.improve import together
+from hsnoise.criticism.story import together
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack

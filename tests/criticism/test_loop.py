@@ -18,7 +18,8 @@ from hsnoise.criticism import candidates as library
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
-from hsnoise.criticism.improve import Step, _is_there, _is_too_little, _left_out, _why_worse, _Work, together
+from hsnoise.criticism.improve import _is_there, _is_too_little, _left_out, _why_worse, _Work
+from hsnoise.criticism.story import Step, together
 from hsnoise.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)

@@ -206,7 +206,7 @@ def test_filters_separate_flats(tmp_path):
         ({"EGAIN": 2.62, "GAIN": 100}, {}, "EGAIN 2.62 e-/DN", 1 / 2.62, True),
         ({"EGAIN": 1.0}, {}, "EGAIN 1 e-/DN", 1.0, False),
         ({"GAIN": 1.5}, {"GAIN": "e-/ADU"}, "GAIN 1.5 e-/DN", 1 / 1.5, False),
-        ({"GAIN": 1.5}, {}, "GAIN 1.5, if it is e-/DN", 1 / 1.5, False),
+        ({"GAIN": 1.5}, {}, "GAIN 1.5 (e-/DN?)", 1 / 1.5, False),
     ],
 )
 def test_stated_gain(tmp_path, header, comment, source, value, certain):

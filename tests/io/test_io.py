@@ -281,6 +281,11 @@ def test_npy_files_are_mapped(tmp_path):
         ("a.npz", {"counts": dark_counts(2, 4, 4)}, r"a.npz: no exposure time \(looked for 'exposure_s'"),
         (
             "a.npz",
+            {"counts": dark_counts(2, 4, 4), "exposure_s": 1, "kind": "dork"},
+            "a.npz: expected kind 'dark' or 'flat', got 'dork'; give kind=",
+        ),
+        (
+            "a.npz",
             {"counts": dark_counts(2, 4, 4), "exposure_s": -1},
             "a.npz: expected an exposure_s >= 0, got -1",
         ),

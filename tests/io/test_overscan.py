@@ -40,7 +40,7 @@ def test_overscan_is_named_by_default(sensor):
 def test_overscan_taken_off(sensor, overscan):
     stack = load(sensor, overscan=overscan)
     assert stack.shape == (40, 88) and stack.assumed == ("The last 12 columns were taken off as overscan",)
-    error_dn = np.sqrt(BLACK_DN / (40 * (WIDTH - 3) * 3))
+    error_dn = np.sqrt(BLACK_DN / (40 * WIDTH / 2 * 3))
     np.testing.assert_allclose(stack.overscan_dn, [500, 460, 420], rtol=0, atol=4 * error_dn)
     np.testing.assert_array_equal(stack.frame(2, 0), load(sensor).frame(2, 0)[:, :88])
 

@@ -1,0 +1,154 @@
+"""What `improve` returns: the steps that a model took, and how the story is told."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise._types import unit_in_words
+from hsnoise.criticism.compare import Comparison, nearer
+from hsnoise.criticism.finding import Diagnosis
+from hsnoise.fit import without_likelihood
+from hsnoise.model import NoiseModel
+from hsnoise.result import FitResult, number, rounded
+
+CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
+SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is
+FINISHED = "Nothing significant is left"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One turn of the loop.
+
+    Attributes:
+        fit, comparison, diagnosis: of the model at the start of this step (diagnosis None at the end).
+        added: name of the effect that was added to reach this model; None for the first.
+        held_out: synthetic log-likelihood of the held-out frames, nats; NaN without any.
+        moved: base parameters that changed by more than two standard errors in this step, in words.
+        ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
+    """
+
+    fit: FitResult
+    comparison: Comparison
+    diagnosis: Diagnosis | None
+    added: str | None
+    held_out: float
+    moved: tuple[str, ...]
+    ahead: float = float("nan")
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """What was fitted of the effect that was added, and what was chosen for it, in words."""
+        if self.added is None:
+            return ()
+        open_ = f"{self.added} fits as well on the other side of the gain: these frames do not tell which it is on."
+        return (*_sizes(self.fit, self.added), *([open_] if self.ahead < SIDES_APART else []))
+
+
+@dataclass(frozen=True)
+class Story:
+    """The history of `improve`.
+
+    Attributes:
+        steps: from the first fit to the last that was kept.
+        ended: why it ended, in a sentence.
+        split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
+    """
+
+    steps: tuple[Step, ...]
+    ended: str
+    split: str = ""
+
+    @property
+    def fit(self) -> FitResult:
+        """The last fit that was kept."""
+        return self.steps[-1].fit
+
+    @property
+    def params(self) -> NoiseModel:
+        return self.fit.params
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing significant was left at the end."""
+        return self.ended.startswith(FINISHED)
+
+    @property
+    def start(self) -> str:
+        """The first model in words: effects beyond the paper's by their names."""
+        return " + ".join(["the paper's model", *without_likelihood(self.steps[0].fit.params)])
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """`error` of each step."""
+        return tuple(step.comparison.error for step in self.steps)
+
+    def plot(self):
+        """A figure of the error falling: `hsnoise.plots.story`."""
+        from hsnoise import plots  # matplotlib is slow to import
+
+        return plots.story(self)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        table = Table("step", "added", "error", "held-out / nats", "worst group")
+        for i, step in enumerate(self.steps):
+            worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
+            held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
+            name = step.added or self.start
+            table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
+        console.print(table)
+        for i, step in enumerate(self.steps):
+            if step.added:
+                before = self.steps[i - 1]
+                console.print(
+                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
+                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
+                    highlight=False,
+                )
+            for sentence in (*step.sizes, *step.moved):
+                console.print(f"  {sentence}", highlight=False)
+        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+        for sentence in (self.ended, care, self.split):
+            if sentence:
+                console.print(sentence, highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+
+def together(before: Step, after: Step) -> str:
+    """What fell, in words, where an addition was kept although the error, that of the worst group, did not fall."""
+    if after.comparison.error <= before.comparison.error:
+        return ""
+    sums = [sum(step.comparison.groups.values()) for step in (before, after)]
+    return f", misfit of all groups together {number(sums[0])} -> {number(sums[1])}"
+
+
+def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
+    rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
+    told = []
+    for label, (value, error, unit) in rows:
+        size, of = rounded(value, error)
+        of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
+        told.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip())
+    chosen = result.params[name].settings().items()
+    told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
+    return tuple(f"{sentence}." for sentence in told)
+
+
+def _because(before: Step, after: Step) -> str:
+    found, reasons = before.diagnosis, nearer(before.comparison, after.comparison)
+    if reasons:
+        reason = reasons[0]
+    else:
+        score = next((one.score for one in found.ranking if one.name == after.added), 0.0) if found else 0.0
+        reason = f"its fingerprint is in the statistics (score {score:.0f} nats)"
+    if found is not None and found.verdict == "unexplained" and after.comparison.error > CHANCE_ERROR:
+        return f"{reason} (no effect explains all that is off; this one comes nearest)"
+    return reason

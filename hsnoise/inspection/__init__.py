@@ -1,0 +1,201 @@
+"""What a capture is, before any fit: `inspect`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from hsnoise._arguments import callback
+from hsnoise.budget import NoiseBudget, budget
+from hsnoise.decomposition import COMPONENTS, Component
+from hsnoise.inspection._facts import Facts, GroupFacts, facts_of
+from hsnoise.inspection._gain import about_gain, clipping, gain_of_flats
+from hsnoise.inspection._odd import odd_frames
+from hsnoise.inspection._verdict import about_growth, judged
+from hsnoise.io import load
+from hsnoise.stack import FrameStack, as_stack
+
+MOST_ROWS = 12  # of the printed budget
+FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is named
+FEW_CODES = 0.5  # DN of noise below which counts are too coarse
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What the frames of a capture are; `print` it.
+
+    Attributes:
+        stack: the capture.
+        groups: facts of each exposure group, those of flats elsewhere on the sensor last.
+        findings: sentences about what is odd.
+        determined: sentences about what can and cannot be determined.
+        verdict: whether a fit makes sense, and why.
+        fit_makes_sense: the same as a bool.
+        next_capture: which capture is worth taking next.
+        budget: the noise budget of a region of the frames; None if there are none that can be used.
+    """
+
+    stack: FrameStack
+    groups: tuple[GroupFacts, ...]
+    findings: tuple[str, ...]
+    determined: tuple[str, ...]
+    verdict: str
+    fit_makes_sense: bool
+    next_capture: str
+    budget: NoiseBudget | None
+
+    def __str__(self) -> str:
+        head, levels, *_ = repr(self.stack).splitlines()
+        parts = [
+            f"{head.replace('FrameStack: ', '')}\n{levels}",
+            "\n".join(_table(self.groups)),
+            _listed("Read as", self.stack.assumed),
+            _listed("Odd", self.findings) or "Nothing odd was found.",
+            "\n".join(_noise_table(self.budget)),
+            _listed("What can be determined", self.determined),
+            f"{self.verdict}\nNext: {self.next_capture}",
+        ]
+        return "\n\n".join(part for part in parts if part)
+
+    __repr__ = __str__
+
+
+def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection:
+    """Look at a capture before any fit: what its frames are, which are odd, and what can be determined from them.
+
+    Every frame is read once; noise and budget are those of a region in the middle if the frames are large.
+
+    Args:
+        path_or_stack: what `load` reads, or a FrameStack, or an array of counts with FrameStack's keywords.
+        progress: called with no argument after each frame.
+        keywords: those of `load` for a path, those of FrameStack for an array.
+
+    Raises:
+        FileNotFoundError, TypeError, ValueError: whatever `load` or `FrameStack` refuse. Frames whose values are wrong
+            are named instead.
+    """
+    tick = callback("progress", progress)
+    is_path = isinstance(path_or_stack, str | PathLike) or _are_paths(path_or_stack)
+    stack = load(path_or_stack, **keywords) if is_path else as_stack(path_or_stack, **keywords)
+    facts = facts_of(stack, tick)
+    elsewhere = None if stack.elsewhere is None else facts_of(stack.elsewhere, tick)
+    main_budget, other_budget = _budget(facts), _budget(elsewhere)
+    gain = gain_of_flats(main_budget, main_budget, facts)
+    if gain is None and elsewhere is not None:
+        gain = gain_of_flats(main_budget, other_budget, elsewhere)
+    groups = facts.groups + (elsewhere.groups if elsewhere is not None else ())
+    is_mosaic = any(group.mosaic for group in groups)
+    found = judged(facts, elsewhere, main_budget, gain, is_mosaic)
+    findings = [
+        *odd_frames(facts),
+        *(odd_frames(elsewhere) if elsewhere is not None else []),
+        *clipping(groups, stack.white_level is not None),
+        *_coarse(groups),
+        *_overscan(stack, facts),
+        *about_growth(main_budget),
+        *about_gain(gain, stack.stated_gain),
+    ]
+    if is_mosaic:
+        findings.append(
+            "Read as mono, but the pixels of each 2 x 2 block differ: a colour sensor? Give cfa='RGGB', say"
+        )
+    return Inspection(
+        stack=stack,
+        groups=groups,
+        findings=tuple(findings),
+        determined=found.determined,
+        verdict=found.verdict,
+        fit_makes_sense=found.fit_makes_sense,
+        next_capture=found.next_capture,
+        budget=main_budget,
+    )
+
+
+def _are_paths(value: Any) -> bool:
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(one, str | PathLike) for one in value)
+
+
+def _budget(facts: Facts | None) -> NoiseBudget | None:
+    return None if facts is None or facts.region is None else budget(facts.region)
+
+
+def _coarse(groups: tuple[GroupFacts, ...]) -> list[str]:
+    """Counts that a converter of fewer bits made, and noise of less than a count."""
+    said = []
+    steps = {group.step_dn for group in groups}
+    if len(steps) == 1 and max(steps) > 1:
+        said.append(f"All counts are multiples of {max(steps)}, apart from an offset: fewer bits were scaled up")
+    fine = [group for group in groups if group.kind == "dark" and group.temporal_dn < FEW_CODES]
+    if fine:
+        said.append(
+            f"The noise of the {fine[0].name} is {fine[0].temporal_dn:.2g} DN, less than the steps between counts:"
+            " read noise will be a bound"
+        )
+    return said
+
+
+def _overscan(stack: FrameStack, facts: Facts) -> list[str]:
+    """A black level that follows the light, by the overscan."""
+    if stack.overscan_dn is not None:
+        overscan = stack.overscan_dn[: len(facts.groups)]
+    else:
+        overscan = np.array([np.mean([frame.overscan_dn for frame in group.frames]) for group in facts.groups])
+    levels = np.array([group.level_dn for group in facts.groups])
+    known = np.isfinite(overscan)
+    if known.sum() < 2:
+        return []
+    dim, bright = (
+        int(pick(np.where(known, levels, value))) for pick, value in ((np.argmin, np.inf), (np.argmax, -np.inf))
+    )
+    moved, signal = overscan[bright] - overscan[dim], levels[bright] - levels[dim]
+    if abs(moved) <= FALLS * signal:
+        return []
+    what = "falls" if moved < 0 else "rises"
+    return [
+        f"The overscan {what} from {overscan[dim]:.0f} to {overscan[bright]:.0f} DN as the level rises from"
+        f" {levels[dim]:.0f} to {levels[bright]:.0f} DN: the black level depends on the signal"
+    ]
+
+
+def _table(groups: tuple[GroupFacts, ...]) -> list[str]:
+    lines = ["kind   exposure / s  frames  degrees C  level / DN  noise / DN  hottest 0.1 % / DN"]
+    for group in groups:
+        temperature = "-" if np.isnan(group.temperature_c) else f"{group.temperature_c:.1f}"
+        noise = "-" if np.isnan(group.temporal_dn) else f"{group.temporal_dn:.4g}"
+        lines.append(
+            f"{group.kind}   {group.exposure_s:12.6g}  {group.n_frames:6d}  {temperature:>9}  {group.level_dn:10.2f}"
+            f"  {noise:>10}  {f'+{group.hot_dn:.4g}':>18}"
+        )
+    return lines
+
+
+def _noise_table(found: NoiseBudget | None) -> list[str]:
+    """The budget as standard deviations, of groups with several frames."""
+    rows = [] if found is None else [row for row in found.rows if row.n_frames > 1]
+    if not rows:
+        return []
+    has_colours = len({row.channel for row in rows}) > 1
+    shown = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, min(MOST_ROWS, len(rows))).astype(int))]
+    heads = [f"{name.replace('_', ' '):>16}" for name in COMPONENTS]
+    some = f" ({len(shown)} of {len(rows)} lines)" if len(shown) < len(rows) else ""
+    lines = [f"Noise budget, standard deviations in DN{some}:", f"{'':{24 if has_colours else 22}}{''.join(heads)}"]
+    for row in shown:
+        name = f"{row.kind} {row.exposure_s:.6g} s" + (f" {row.channel}" if has_colours else "")
+        lines.append(f"{name:{24 if has_colours else 22}}{''.join(_cell(row.components[one]) for one in COMPONENTS)}")
+    return lines
+
+
+def _cell(component: Component) -> str:
+    """Standard deviation, DN, or what it is below."""
+    value, error = component.variance_dn2, component.standard_error_dn2
+    if not np.isfinite(value):
+        return f"{'-':>16}"
+    bound = f"< {np.sqrt(max(value, 0.0) + 2 * error):.2g}"
+    return f"{bound if value < 2 * error else f'{np.sqrt(value):.3g}':>16}"
+
+
+def _listed(title: str, sentences: tuple[str, ...]) -> str:
+    return "\n".join([f"{title}:", *(f"- {one}" for one in sentences)]) if sentences else ""
