@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from hsnoise import cameras
+from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
 from hsnoise.fit import FitResult, fit
@@ -23,8 +24,10 @@ __all__ = [
     "AbstractEffect",
     "FitResult",
     "FrameStack",
+    "NoiseBudget",
     "NoiseModel",
     "Stage",
+    "budget",
     "cameras",
     "compare",
     "diagnose",

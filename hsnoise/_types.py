@@ -43,6 +43,14 @@ def unit_in_words(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
+def seconds(exposure_s: float) -> str:
+    """An exposure for a label: 25 µs, 50 ms, 1.5 s."""
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
+        if exposure_s * factor >= 1:
+            return f"{exposure_s * factor:.4g} {unit}"
+    return f"{exposure_s:g} s"
+
+
 def channels_of(cfa: str) -> tuple[str, ...]:
     """Names of the channels of a colour filter array: ("mono",) or ("R", "G", "B").
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from hsnoise._arguments import callback
+from hsnoise._budget_table import printed
+from hsnoise._joining import replaced
 from hsnoise.decomposition import COMPONENTS, Component
-from hsnoise.pixels.classes import growth_noise, levels_of, slope_over
+from hsnoise.draws import check_fits, draw_capture
+from hsnoise.model import NoiseModel
+from hsnoise.pixels.classes import levels_of, slope_over
 from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
 from hsnoise.pixels.survey import Group, Survey, survey
-from hsnoise.stack import as_stack
+from hsnoise.stack import FrameStack, as_stack
 
-HEADINGS = {"row_x_frame": "row x frame", "column_x_frame": "column x frame"}
+TOP_SHARE, FEWEST_TOP = 1e-3, 10  # of the pixels, that are the tail
+MOST_DRAWN = (8, 320, 480)  # frames, rows and columns of a capture that is drawn from a model
 
 
 class TableRow(NamedTuple):
@@ -46,12 +48,22 @@ class BudgetRow:
     saturated_share: float
     components: Mapping[str, Component]
 
+    @property
+    def total_dn2(self) -> float:
+        """Sum of the components, DN^2; NaN with one frame."""
+        return float(sum(max(c.variance_dn2, 0.0) for c in self.components.values()))
+
 
 @dataclass(frozen=True)
 class PixelSpread:
-    """How one number differs between pixels: median, standard deviation of the core, 99.9 % quantile above the median.
+    """How one number differs between pixels, the noise of its estimation taken off.
 
-    The noise of its estimation is taken off `spread`; of `tail` it is a small part.
+    Attributes:
+        median: of all pixels.
+        spread: standard deviation of the core.
+        tail: by how much the highest 0.1 % of the pixels typically exceed the median: they are chosen in one half of
+            the frames and measured in the other.
+        unit: of all three.
     """
 
     median: float
@@ -70,13 +82,15 @@ class NoiseBudget:
         pixels: (colour, what) to how it differs between pixels: "offset", "dark signal", "temporal noise".
         flags: colour to the share of pixels that are stuck, dead, hot, telegraph-like (NaN: not told).
         survey: what the pass over the pixels kept.
+        stack: the frames, for `under`.
     """
 
     rows: tuple[BudgetRow, ...]
     growth: Mapping[tuple[str, str], tuple[float, float]]
     pixels: Mapping[tuple[str, str], PixelSpread]
     flags: Mapping[str, Mapping[str, float]]
-    survey: Survey = field(repr=False)
+    survey: Survey
+    stack: FrameStack
 
     @property
     def table(self) -> tuple[TableRow, ...]:
@@ -88,64 +102,49 @@ class NoiseBudget:
         )
 
     def to_pandas(self) -> Any:
-        """`table` as a pandas DataFrame (needs pandas: pip install pandas)."""
+        """`table` as a pandas DataFrame (needs pandas: pip install hsnoise[pandas])."""
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("NoiseBudget.to_pandas: needs pandas; pip install pandas") from error
+            raise ImportError("NoiseBudget.to_pandas: needs pandas; pip install hsnoise[pandas]") from error
         return pandas.DataFrame(self.table, columns=TableRow._fields)
 
-    def plot(self, model: Any = None) -> Any:
-        """Stacked bars of the components on a log axis; with `model`, a NoiseModel, its own budget beside each."""
+    def under(self, model: NoiseModel) -> NoiseBudget:
+        """The budget of a capture drawn from `model` as this one was taken; of large frames the middle is drawn.
+
+        Raises:
+            TypeError, ValueError: a model of another sensor, or one that makes no counts.
+        """
+        check_fits(model, self.stack, "model")
+        frames, rows, columns = MOST_DRAWN
+        # What depends on the place stays where it is on the sensor.
+        whole = replaced(self.stack, window=self.stack.window or (0, 0, *self.stack.shape))
+        part = whole.select(
+            frames=slice(0, frames),
+            rows=_middle(self.stack.shape[0], rows),
+            columns=_middle(self.stack.shape[1], columns),
+        )
+        return budget(draw_capture(0, model, part))
+
+    def plot(self, model: NoiseModel | None = None) -> Any:
+        """Figure of `hsnoise.plots.budget`: the components, with `model` its own beside them."""
         from hsnoise import plots  # brings matplotlib, which is slow to import
 
         return plots.budget(self, model)
 
     def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=132, color_system=None)
-        console.print("Noise budget: variances in DN² ± standard error, and their share", highlight=False)
-        console.print(self.as_table())
-        for sentence in self.sentences():
-            console.print(f"- {sentence}", highlight=False)
-        return console.file.getvalue().rstrip()
+        return printed(self)
 
     __repr__ = __str__
 
-    def as_table(self) -> Table:
-        """The table of `print`, for rich."""
-        table = Table()
-        colours = len({row.channel for row in self.rows}) > 1
-        for heading in ("exposure", *(["colour"] if colours else []), "mean / DN"):
-            table.add_column(heading, justify="right", no_wrap=True)
-        for name in COMPONENTS:
-            table.add_column(HEADINGS.get(name, name), justify="right", no_wrap=True)
-        for row in self.rows:
-            lit = "flat " if row.kind == "flat" else ""
-            first = [f"{lit}{row.exposure_s:.4g} s", *([row.channel] if colours else []), f"{row.mean_dn:.5g}"]
-            table.add_row(*first, *(_cell(row.components[name]) for name in COMPONENTS))
-        return table
-
     def sentences(self) -> list[str]:
-        """What the table does not show: clipping, pixels that differ, pixels that are no noise."""
+        """Pixels that are stuck, dead, hot, or telegraph-like."""
         said = []
-        for row in self.rows:
-            where = f"{row.kind} {row.exposure_s:g} s" + ("" if row.channel == "mono" else f", {row.channel}")
-            if row.clipped_share > 0:
-                said.append(f"{where}: {row.clipped_share:.2g} of the counts are 0 (clipped).")
-            if row.saturated_share > 0:
-                said.append(f"{where}: {row.saturated_share:.2g} of the counts are at the white level.")
-        for (channel, what), one in self.pixels.items():
-            of = what if channel == "mono" else f"{what}, {channel}"
-            said.append(
-                f"Pixels differ in {of}: median {one.median:.4g}, spread {one.spread:.3g}, 99.9 % of them below median"
-                f" + {one.tail:.3g} {one.unit}."
-            )
         for channel, shares in self.flags.items():
+            of = "" if channel == "mono" else f", {channel}"
             listed = [f"{name} {100 * share:.2g} %" for name, share in shares.items() if share > 0]
             if listed:
-                said.append(
-                    f"Pixels that are no noise{'' if channel == 'mono' else f', {channel}'}: {', '.join(listed)}."
-                )
+                said.append(f"Defective pixels{of}: {', '.join(listed)}.")
         return said
 
 
@@ -172,17 +171,23 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
     tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
     stack.check()
-    return budget_of(survey(stack, tick))
+    return budget_of(survey(stack, tick), stack)
 
 
-def budget_of(found: Survey) -> NoiseBudget:
-    """The budget of a survey."""
+def budget_of(found: Survey, stack: FrameStack) -> NoiseBudget:
+    """The budget of a survey of `stack`."""
     rows = tuple(_row(found, group, c) for group in found.groups for c in range(len(found.channels)))
     flags = {name: _told_flags(found, c) for c, name in enumerate(found.channels)}
     pixels = {}
     for c, name in enumerate(found.channels):
         pixels.update({(name, what): one for what, one in _spreads(found, c).items()})
-    return NoiseBudget(rows, _growth(rows), pixels, flags, found)
+    return NoiseBudget(rows, _growth(rows), pixels, flags, found, stack)
+
+
+def _middle(size: int, most: int) -> slice:
+    """At most `most` of a side, even at both ends."""
+    first = max((size - most) // 4 * 2, 0)
+    return slice(first, min(first + most, size))
 
 
 def _row(found: Survey, group: Group, channel: int) -> BudgetRow:
@@ -254,25 +259,12 @@ def _spreads(found: Survey, channel: int) -> dict[str, PixelSpread]:
 
 
 def _spread(values: np.ndarray, unit: str) -> PixelSpread:
-    """Of values in two halves of the frames [half, pixel]; their covariance is free of the noise of estimation."""
+    """Of values in two halves of the frames [half, pixel]: what both share is free of the noise of estimation."""
     mean = values.mean(0, dtype=np.float64)
     median = float(np.median(mean))
     width = 5 * 1.4826 * float(np.median(np.abs(mean - median))) + 1e-12
     a, b = np.clip(values.astype(np.float64), median - width, median + width)
     covariance = float(((a - a.mean()) * (b - b.mean())).mean())
-    noise = growth_noise(values) if len(mean) else 0.0
-    tail = max(float(np.quantile(mean, 0.999)) - median, 0.0)
-    return PixelSpread(median, float(np.sqrt(max(covariance, 0.0))), float(max(tail**2 - noise**2, 0.0) ** 0.5), unit)
-
-
-def _cell(component: Component) -> str:
-    if not np.isfinite(component.variance_dn2):
-        return "-"
-    value, error = component.variance_dn2, component.standard_error_dn2
-    if value < 2 * error:
-        return f"< {max(value, 0) + 2 * error:.2g}"
-    return f"{value:.3g} ± {error:.1g} {_percent(component.share)}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:3.0f} %" if share >= 0.1 else f"{100 * share:3.1f} %" if share >= 5e-4 else "< 0.1 %"
+    few = min(max(FEWEST_TOP, int(TOP_SHARE * len(mean))), len(mean))
+    top = [np.median(values[1 - half][np.argpartition(values[half], -few)[-few:]]) for half in (0, 1)]
+    return PixelSpread(median, float(np.sqrt(max(covariance, 0.0))), max(float(np.mean(top)) - median, 0.0), unit)

@@ -203,7 +203,7 @@ def test_flats_alone_have_a_photon_transfer():
     key = jax.random.key(2)
     lit = [hsnoise.sample(key, np.full((3, 32, 64), e), truth, exposure_s=0.1) for e in (20.0, 100.0, 500.0)]
     summary = summarise(hsnoise.FrameStack(lit, [0.1] * 3, kind="flat", black_level=100, shutter="global"))
-    fit = SimpleNamespace(summary=summary, physics=physics_of(truth), params=truth)
+    fit = SimpleNamespace(summary=summary, physics=physics_of(truth), params=truth, transfer=None)
     axes, gains = plots.photon_transfer(fit).axes
     assert "gain against signal" in gains.get_title()
     signal = axes.collections[-1].get_offsets()[:, 0]

@@ -16,7 +16,8 @@ from scipy.special import erfcx, ndtr
 
 from hsnoise.pixels.classes import Levels, growth_noise, slope_over
 
-NODES = 48  # of the log-normal distribution
+NODES = 48  # of the log-normal distribution, or of the noise where that is the narrower one
+WIDE = 0.5  # of the log-normal width: noise from which on it is the wider one
 CORE_BINS, TAIL_BINS = 120, 80
 APART_SIGMAS, APART_SHARE = 6.0, 0.3  # growth in two halves that disagrees by more is a hit or a jump, not a growth
 SIGNIFICANT = 15.0  # twice the gain in log-likelihood from which pixels differ in dark current
@@ -112,12 +113,18 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
 def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
     """Share of pixels whose measured growth is below x: log-normal, in a fraction plus exponential, plus noise."""
     z, weight = np.polynomial.hermite_e.hermegauss(NODES)
+    weight = weight / weight.sum()
     body = mean * np.exp(spread * z - spread**2 / 2)
     off = (x[:, None] - body) / noise
-    plain = ndtr(off)
+    if noise > WIDE * spread * mean:
+        plain = ndtr(off) @ weight
+    else:  # between nodes of the log-normal distribution, narrow noise would leave steps
+        left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
+        plain = ndtr(np.log(left) / spread + spread / 2) @ weight
     if fraction > 0:
-        plain = plain - fraction * _exponential_share(off, noise / rate)
-    return plain @ (weight / weight.sum())
+        warm = (ndtr(off) - _exponential_share(off, noise / rate)) @ weight
+        plain = (1 - fraction) * plain + fraction * warm
+    return plain
 
 
 def _exponential_share(off: np.ndarray, ratio: float) -> np.ndarray:

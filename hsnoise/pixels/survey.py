@@ -156,7 +156,7 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
         row_frame_dn=row_frame - row_frame.mean(0) - row_frame.mean(1, keepdims=True) + row_frame.mean(),
-        components=_with_tails(sums.components(), halves, h * w),
+        components=_with_tails(sums.components(), halves, sums.shape),
         halves=halves,
         narrow_dn=_narrow(counts, halves),
     )
@@ -169,14 +169,15 @@ def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | 
     return narrow_read_noise(counts)
 
 
-def _with_tails(found: dict[str, Component], halves: Halves | None, pixels: int) -> dict[str, Component]:
+def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple[int, int]) -> dict[str, Component]:
     """Standard errors of what pixels carry from the pixels themselves: their noise differs, and has tails."""
     if halves is None:
         return found
-    level = halves.level_dn.mean(0, dtype=np.float64)
-    scatter = {"temporal": halves.pair_variance_dn2, "pixel": (level - level.mean()) ** 2}
+    level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, shape[1])
+    level = level - level.mean(0) - level.mean(1, keepdims=True) + level.mean()
+    scatter = {"temporal": halves.pair_variance_dn2, "pixel": level**2}
     for name, values in scatter.items():
-        error = float(values.std(dtype=np.float64)) / np.sqrt(pixels)
+        error = float(values.std(dtype=np.float64)) / np.sqrt(shape[0] * shape[1])
         found[name] = Component(found[name].variance_dn2, max(error, found[name].standard_error_dn2))
     total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
     return {

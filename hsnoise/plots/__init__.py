@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+from hsnoise.plots._budget import budget
 from hsnoise.plots._criticism import comparison, ranking, story
 from hsnoise.plots._histograms import histograms
+from hsnoise.plots._of_fit import of_fit
 from hsnoise.plots._photon_transfer import photon_transfer
+from hsnoise.plots._pixel_map import pixel_map
+from hsnoise.plots._pixel_transfer import pixel_transfer
 from hsnoise.plots._row_spectrum import row_spectrum
+from hsnoise.plots._sampled import dark_current
 
-__all__ = ["comparison", "histograms", "photon_transfer", "ranking", "row_spectrum", "story"]
+__all__ = [
+    "budget",
+    "comparison",
+    "dark_current",
+    "histograms",
+    "of_fit",
+    "photon_transfer",
+    "pixel_map",
+    "pixel_transfer",
+    "ranking",
+    "row_spectrum",
+    "story",
+]

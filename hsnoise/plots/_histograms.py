@@ -7,7 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, seconds, tidy, title_of
+from hsnoise._types import seconds
+from hsnoise.plots._sampled import sampled_histograms
+from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms
 
 MOST_BINS = 90  # that can be told apart in a panel
@@ -21,7 +23,8 @@ def histograms(fit) -> Figure:
     Logarithmic, so that the tails show. Residuals are in standard deviations of a measured bin, estimated from its
     scatter between frames (between rows if there is one frame): all pixels of a row share a gain, so that
     a bin scatters more than its square root. The outermost bins hold all that lies beyond. Of many exposures
-    six are shown.
+    six are shown. Where pixels differ, no one distribution holds for all
+    of them: counts are then sampled from the model.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.
@@ -32,6 +35,8 @@ def histograms(fit) -> Figure:
     summary = fit.summary
     if not summary.histograms:
         raise ValueError("fit: histograms need dark frames in the stack, and there are none")
+    if fit.transfer is not None:
+        return sampled_histograms(fit)
     exposures = len(summary.exposure_s)
     shown = np.unique(np.linspace(0, exposures - 1, min(exposures, MOST_EXPOSURES)).round().astype(int))
     columns = len(summary.histograms)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,6 +14,7 @@ from hsnoise.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.moments import binned_moments
 from hsnoise.physics import Physics, black_level_at, flat_gain_of
 from hsnoise.plots._moments import beta_rule, count_moments
+from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary, far_outliers
 
@@ -22,7 +26,8 @@ def photon_transfer(fit) -> Figure:
     """Variance against mean of the counts, measured and fitted: the photon transfer curve.
 
     Darks: one point per exposure and colour, its variance taken within rows, so that row offsets and the spread
-    of row gains between rows do not enter, nor do pixels far hotter than all others. Flats: one point per level and
+    of row gains between rows do not enter, nor do pixels far hotter than all others. Where pixels differ, that is no
+    noise: there, classes of pixels over time are shown (`pixel_transfer`). Flats: one point per level and
     colour, temporal variance within rows above that of the darks; and that over signal, with the curve that was fitted
     and the gain that follows from it at each signal. Solid: what the fitted model expects of the recorded counts;
     dashed, where clipping matters: what the sensor delivered before it was clipped. Hollow points: more than 0.1 % of
@@ -31,18 +36,46 @@ def photon_transfer(fit) -> Figure:
     Args:
         fit: result of `hsnoise.fit`.
 
+    Raises:
+        ValueError: pixels differ, and there are neither darks of two exposures nor flats.
+
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
-    summary, physics = fit.summary, fit.physics
-    lit = summary.flats is not None and summary.flats.mean_dn.size > 0
-    drawings = ((_darks, bool(summary.histograms)), (_flats, lit), (_gains, lit))
-    panels = [draw for draw, there in drawings if there]
-    figure = new_figure(6.4 * len(panels), 5.0, title_of("Photon transfer: variance against mean of the counts", fit))
+    panels = _panels(fit)
+    if not panels:
+        raise ValueError("fit: where pixels differ, photon transfer needs darks of two exposures, or flats")
+    title = "Photon transfer: variance against mean of the counts"
+    title = title_of(title, fit) if fit.transfer is None else title
+    figure = new_figure(6.4 * len(panels), 5.0, title)
     for axes, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        draw(axes, physics, summary)
         axes.set_xlabel("mean above black level / DN")
+        draw(axes)
         tidy(axes)
     return figure
+
+
+def has_photon_transfer(fit) -> bool:
+    """Whether `photon_transfer` has something to draw."""
+    return bool(_panels(fit))
+
+
+def _panels(fit) -> list[Callable[[Axes], None]]:
+    summary, physics = fit.summary, fit.physics
+    panels: list[Callable[[Axes], None]] = []
+    if transfers_of(fit):
+        panels.append(partial(_classes, fit=fit))
+    elif fit.transfer is None and summary.histograms:
+        panels.append(partial(_darks, physics=physics, summary=summary))
+    if summary.flats is not None and summary.flats.mean_dn.size:
+        panels += [partial(draw, physics=physics, summary=summary) for draw in (_flats, _gains)]
+    return panels
+
+
+def _classes(axes: Axes, fit) -> None:
+    draw_variances(axes, transfers_of(fit))
+    axes.set_title("dark frames, classes of pixels over time", fontsize=10)
+    axes.set_ylabel("temporal variance / DN²")
+    axes.set_xlabel("dark signal / DN")
 
 
 def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:

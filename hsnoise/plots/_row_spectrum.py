@@ -8,9 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hsnoise import rows
+from hsnoise._types import seconds
 from hsnoise.physics import Physics
 from hsnoise.plots._moments import beta_rule, count_moments
-from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, seconds, tidy, title_of
+from hsnoise.plots._pixel_transfer import transfers_of
+from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3
@@ -24,26 +26,27 @@ def row_spectrum(fit) -> Figure:
     """Power spectrum of the row gain along the rows, measured and fitted, log-log; one panel per colour.
 
     Measured: the periodogram of row means, divided by how strongly the mean of a row depends on its gain, averaged
-    over the frames of the exposure that shows the row gain best. Fitted: row gain plus what the noise of the
+    over the frames of the exposure that shows the row gain best. What a row has in all frames (hot pixels, fixed
+    patterns) is no row gain and is taken off, unless there is one frame. Fitted: row gain plus what the noise of the
     pixels leaves in a row mean. Power is normalised so that its mean over all frequencies is the variance over rows.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.
 
     Raises:
-        ValueError: there are no dark frames or no row gain in the model.
+        ValueError: there are no dark frames, no row gain in the model, or no dark signal that would show it.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019, Fig. 3.
     """
-    summary, physics = fit.summary, fit.physics
-    if not summary.histograms or physics.row_sigma is None:
-        missing = "dark frames in the stack" if not summary.histograms else "row_gain in the model"
-        raise ValueError(f"fit: a row spectrum needs {missing}, and there is none")
+    summary = fit.summary
+    if not has_row_spectrum(fit):
+        raise ValueError("fit: a row spectrum needs dark frames, row_gain in the model, and dark signal that shows it")
     channels = len(summary.histograms)
-    figure = new_figure(max(4.3 * channels, 6.4), 4.6, title_of("Spectrum of the row gain", fit))
+    title = title_of("Spectrum of the row gain", fit) if fit.transfer is None else "Spectrum of the row gain"
+    figure = new_figure(max(4.3 * channels, 6.4), 4.6, title)
     panels = figure.subplots(1, channels, squeeze=False, sharey=True)[0]
     for c, (axes, histograms) in enumerate(zip(panels, summary.histograms, strict=True)):
-        _panel(axes, physics, c, histograms, summary)
+        _panel(axes, fit, c, histograms)
     lines = [line for one in panels for line in one.lines]
     low = min(float(np.min(line.get_ydata())) for line in lines if line.get_label() != ALONE)
     shown = [line for line in lines if line.get_label() != ALONE or np.max(line.get_ydata()) > FAINT * low]
@@ -58,11 +61,21 @@ def row_spectrum(fit) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, physics: Physics, c: int, histograms: RowHistograms, summary: Summary) -> None:
-    slope, noise = _response(physics, c, histograms, summary)
+def has_row_spectrum(fit) -> bool:
+    """Whether the frames show the row gain; where pixels differ, only one that was found there."""
+    if not fit.summary.histograms or fit.physics.row_sigma is None:
+        return False
+    return fit.transfer is None or bool(transfers_of(fit)) and bool(np.max(fit.physics.row_sigma) > 0)
+
+
+def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:
+    summary, physics = fit.summary, fit.physics
+    slope, noise = (_response if fit.transfer is None else _of_pixels)(fit, c, histograms)
     e = int(np.argmax(slope**2 / noise))
     row_mean = _row_means(histograms, e)
     frames, n_rows = row_mean.shape
+    if frames > 1:
+        row_mean = (row_mean - row_mean.mean(0)) * np.sqrt(frames / (frames - 1))
     k = np.arange(1, n_rows // 2 + 1)
     power = (np.abs(np.fft.rfft(row_mean, axis=1)) ** 2).mean(0)[1:] / n_rows / slope[e] ** 2
     floor = noise[e] / slope[e] ** 2
@@ -94,13 +107,24 @@ def _count(frames: int) -> str:
     return f"{frames} dark frame{'s' if frames > 1 else ''}"
 
 
-def _response(physics: Physics, c: int, histograms: RowHistograms, summary: Summary):
+def _response(fit, c: int, histograms: RowHistograms):
     """Change of a row's mean with its gain (DN) and variance of a row mean from its pixels (DN^2): [exposure]."""
+    physics, summary = fit.physics, fit.summary
     sigma = max(float(physics.row_sigma[c]), 1e-3)
     beta, weight = beta_rule(sigma)
     mean, variance = count_moments(physics, c, summary.exposure_s, beta, summary.white_level_dn)
     slope = mean @ (weight * (beta - 1)) / sigma**2
     return slope, variance @ weight / histograms.row_pixels.max((1, 2))
+
+
+def _of_pixels(fit, c: int, histograms: RowHistograms):
+    """As `_response`, where pixels differ: from their mean signal and their mean variance over time; [exposure]."""
+    transfer = fit.transfer.channels[c].transfer
+    classes, t = transfer.classes, fit.summary.exposure_s
+    share = classes.pixels / classes.pixels.sum()
+    variance = np.interp(t, classes.exposure_s, share @ classes.variance_dn2)
+    signal = np.maximum(share @ classes.growth_dn_per_s, 1e-9) * np.maximum(t, 1e-3 * t.max())
+    return signal, variance / histograms.row_pixels.max((1, 2))
 
 
 def _row_means(histograms: RowHistograms, exposure: int) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from hsnoise.fit import without_likelihood
 from hsnoise.result import FitResult
@@ -13,7 +15,10 @@ COLOURS = {"R": "#D55E00", "G": "#009E73", "B": "#0072B2", "mono": "#404040"}
 MARKERS = {"R": "o", "G": "s", "B": "^", "mono": "o"}
 NAMES = {"R": "red", "G": "green", "B": "blue", "mono": "all pixels"}
 FIT = "black"
+HOT = "#E69F00"  # hot pixels, beside a colour's own
 DPI = 110
+SHORT_DECADES = 2.5
+TICKS_APART = 0.09  # of the axis, at least
 
 
 def title_of(text: str, fit: FitResult) -> str:
@@ -29,17 +34,31 @@ def new_figure(width_in: float, height_in: float, title: str) -> Figure:
     return figure
 
 
+def bend_axis(axes: Axes, near: float, low: float, high: float) -> None:
+    """A horizontal axis that is linear within about `near` of 0 and logarithmic beyond, smoothly; plain numbers."""
+    axes.set_xscale("asinh", linear_width=near)
+    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(max(-low, high, near))) + 1)
+    apart, ticks = TICKS_APART * (np.arcsinh(high / near) - np.arcsinh(low / near)), [0.0]
+    for x in (f * sign * d for f in (1, 5, 2) for sign in (1, -1) for d in decades[::-1]):
+        if low <= x <= high and np.abs(np.arcsinh(np.array(ticks) / near) - np.arcsinh(x / near)).min() > apart:
+            ticks.append(x)
+    axes.set_xticks(ticks, [f"{x:,g}" for x in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlim(low, high)
+
+
+def plain_log(axes: Axes) -> None:
+    """A vertical logarithmic axis with plain numbers, more than one in a decade where it spans few."""
+    low, high = axes.get_ylim()
+    short = np.log10(high / low) < SHORT_DECADES
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
+    axes.yaxis.set_major_formatter(lambda y, _: f"{y:,g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
 def tidy(axes: Axes) -> None:
     """A light grid behind the data, no frame above and on the right."""
     axes.grid(True, which="major", color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9)
-
-
-def seconds(exposure_s: float) -> str:
-    """An exposure for a label: 25 us, 50 ms, 1.5 s."""
-    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
-        if exposure_s * factor >= 1:
-            return f"{exposure_s * factor:.4g} {unit}"
-    return f"{exposure_s:g} s"

@@ -18,9 +18,10 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullF
 from PIL import Image
 
 from hsnoise import plots
+from hsnoise._types import seconds
 from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.model import NoiseModel
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, seconds, tidy
+from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy
 from hsnoise.report import _measured
 from hsnoise.report._measured import Shown
 from hsnoise.result import FitResult

@@ -1,0 +1,37 @@
+"""The distribution of dark current over pixels: its law, and the fit of it, against draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsnoise.pixels.population import _fitted, growth_cdf
+
+TRUTHS = [(30.0, 0.4, 0.005, 180.0), (20.0, 0.2, 0.02, 100.0), (5.0, 0.6, 0.0, 1.0)]
+NOISES = [0.8, 4.0, 15.0]  # far narrower than the population, about as wide, wider
+
+
+def drawn(rng, n, noise, mean, spread, fraction, rate):
+    body = mean * np.exp(spread * rng.standard_normal(n) - spread**2 / 2)
+    hot = np.where(rng.random(n) < fraction, rng.exponential(rate, n), 0.0)
+    return body + hot + noise * rng.standard_normal(n)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("truth", TRUTHS, ids=str)
+def test_distribution_of_growth_is_that_of_draws(truth, noise):
+    growth = drawn(np.random.default_rng(1), 400_000, noise, *truth)
+    x = np.quantile(growth, np.linspace(0.001, 0.9995, 300))
+    cdf = growth_cdf(x, noise, *truth)
+    measured = np.searchsorted(np.sort(growth), x) / len(growth)
+    assert np.abs(cdf - measured).max() < 5 * np.sqrt(0.25 / len(growth))
+    assert np.all(np.diff(cdf) > 0)
+
+
+@pytest.mark.parametrize("noise", NOISES[:2])
+def test_population_is_recovered_whatever_the_noise(noise):
+    truth = TRUTHS[0]
+    values, errors = _fitted(drawn(np.random.default_rng(2), 60_000, noise, *truth), noise)
+    pulls = (values - truth) / errors
+    assert np.all(np.abs(pulls) < 4), (values, errors)
+    assert np.all(errors < 0.2 * np.array(truth))
