@@ -135,8 +135,8 @@ def _method_argument(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=("auto", "ml", "line", "transfer"),
         default="auto",
-        help="ml: maximum likelihood; line: the paper's line fit; transfer: each pixel over time; auto (default): ml, or "
-        "transfer where pixels differ",
+        help="ml: maximum likelihood; line: the paper's line fit; transfer: each pixel over time; auto (default): ml, "
+        "or transfer where pixels differ",
     )
 
 
