@@ -1,0 +1,176 @@
+"""Fits that are conditional on the pixel: the gain where pixels differ, what is withheld, what is doubted."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from benchmarks.pixel_simulator import DETERMINED, UNDETERMINED, draw
+from hsnoise._types import StatedGain
+from hsnoise.effects import ADC, BlackLevel, Gain, HotPixels, ReadNoise, ShotNoise
+from hsnoise.pixels.clipping import clipped_moments, unclipped
+
+KNOWN = ("exposure_s", "black_level", "white_level", "cfa", "shutter")
+
+
+def capture(sensor, seed: int = 0) -> hsnoise.FrameStack:
+    drawn = draw(sensor, np.random.default_rng([zlib.crc32(str(sensor).encode()), seed]))
+    return hsnoise.FrameStack(drawn["counts"], **{name: drawn[name] for name in KNOWN})
+
+
+@pytest.fixture(scope="module")
+def warm() -> hsnoise.FitResult:
+    return hsnoise.fit(capture(DETERMINED["CCD warm"]))
+
+
+@pytest.mark.parametrize("kind", ["CCD cool", "CMOS warm", "column pattern", "clipped at 0", "Bayer"])
+def test_gain_and_read_noise_are_those_of_the_sensor(kind):
+    sensor, fit = DETERMINED[kind], hsnoise.fit(capture(DETERMINED[kind]))
+    assert fit.method == "transfer"
+    gains = [row for name, row in fit.table.items() if name.split(".")[0] == "gain"]
+    for (value, error, _), truth in zip(gains, sensor.gain_dn_per_e, strict=True):
+        assert abs(value - truth) < max(4 * error, 0.02 * truth)
+        assert error < 0.05 * truth
+    value, error, _ = fit.table["read_noise.sigma"]
+    assert abs(value - sensor.read_noise_e) < max(4 * error, 0.03 * sensor.read_noise_e)
+
+
+@pytest.mark.parametrize("kind", list(UNDETERMINED))
+def test_a_gain_that_the_frames_do_not_tell_is_withheld(kind):
+    try:
+        fit = hsnoise.fit(capture(UNDETERMINED[kind]))
+    except ValueError as refusal:
+        assert "gain" in str(refusal) or "exposure" in str(refusal) or "black" in str(refusal)
+        return
+    value, error, unit = fit.table["gain"]
+    assert np.isnan(value) and error == np.inf and unit == "DN/e-"
+    assert not fit.trustworthy
+    assert "gain is not determined" in fit.doubts[0] and "flats" in fit.doubts[0]
+    assert str(fit).index("not determined:") < str(fit).index("parameter")  # above the table
+
+
+def test_the_population_is_in_the_model_and_is_drawn(warm):
+    sensor = DETERMINED["CCD warm"]
+    assert {"dark_current_nonuniformity", "hot_pixels"} <= set(warm.added)
+    assert warm.table["dark_current_nonuniformity.spread"][0] == pytest.approx(sensor.spread, rel=0.1)
+    longest = max(sensor.exposure_s)
+    drawn = np.asarray(hsnoise.sample_dark(jax.random.key(1), 6, (128, 192), warm.params, exposure_s=longest), float)
+    measured = np.stack(list(capture(sensor).frames(len(sensor.exposure_s) - 1))).astype(float)
+    for quantile in (0.05, 0.5, 0.95):
+        low, high = (np.quantile(x.mean(0), quantile) for x in (drawn, measured))
+        assert low == pytest.approx(high, abs=0.15 * measured.mean(0).std())
+
+
+def test_a_trustworthy_fit_says_nothing_above_the_table(warm):
+    assert warm.trustworthy and not warm.grave
+    assert "!" not in str(warm).split("┏")[0]
+
+
+def test_maps_are_those_of_the_pixels(warm, tmp_path):
+    maps = warm.pixels
+    assert maps.dark_current_unit == "e-/s"
+    sensor = DETERMINED["CCD warm"]
+    assert maps.offset_dn.shape == sensor.shape
+    assert np.median(maps.offset_dn) == pytest.approx(sensor.black_dn, abs=3)
+    assert np.median(maps.dark_current) == pytest.approx(warm.table["dark_current.rate"][0], rel=0.15)
+    assert 0.001 < np.mean(maps.flags & 4 > 0) < 0.2
+    maps.save(tmp_path / "maps.npz")
+    maps.save(tmp_path / "maps.fits")
+    with np.load(tmp_path / "maps.npz") as kept:
+        np.testing.assert_array_equal(kept["offset_dn"], maps.offset_dn)
+    from astropy.io import fits
+
+    with fits.open(tmp_path / "maps.fits") as kept:
+        np.testing.assert_array_equal(kept["DARK_CURRENT"].data, maps.dark_current)
+    with pytest.raises(ValueError, match=r"\.npz or \.fits"):
+        maps.save(tmp_path / "maps.txt")
+
+
+def test_a_header_that_states_another_gain_is_doubted():
+    stack = capture(DETERMINED["CMOS warm"])
+    sensor = DETERMINED["CMOS warm"]
+    wrong = StatedGain(1.5 * sensor.gain_dn_per_e[0], "EGAIN 0.33 e-/DN", True)
+    object.__setattr__(stack, "stated_gain", wrong)
+    fit = hsnoise.fit(stack)
+    assert any("EGAIN" in doubt for doubt in fit.doubts) and not fit.trustworthy
+
+
+def test_a_black_level_that_is_off_by_a_count_is_doubted():
+    sensor = dataclasses.replace(DETERMINED["column pattern"], frame_jitter_dn=0.0)
+    drawn = draw(sensor, np.random.default_rng(3))
+    known = {name: drawn[name] for name in KNOWN if name != "black_level"}
+    for off, doubted in ((0.0, False), (-1.0, True), (1.0, True)):
+        fit = hsnoise.fit(drawn["counts"], black_level=sensor.black_dn + off, **known)
+        assert any("black level" in doubt for doubt in fit.doubts) is doubted, off
+
+
+@pytest.mark.parametrize("pixels, method", [("alike", "ml"), ("differ", "transfer")])
+def test_pixels_overrules_the_test(pixels, method):
+    frames = hsnoise.sample_dark(jax.random.key(0), 4, (48, 64), hsnoise.cameras.grasshopper3(), exposure_s=0.05)
+    longer = hsnoise.sample_dark(jax.random.key(1), 4, (48, 64), hsnoise.cameras.grasshopper3(), exposure_s=0.4)
+    counts, camera = [np.asarray(frames), np.asarray(longer)], hsnoise.cameras.grasshopper3()
+    fit = hsnoise.fit(counts, exposure_s=[0.05, 0.4], cfa=camera.cfa, shutter=camera.shutter, pixels=pixels)
+    assert fit.method == method
+
+
+def test_bad_choices_are_named():
+    counts = np.random.default_rng(0).poisson(50, (4, 32, 32)).astype(np.uint16)
+    with pytest.raises(ValueError, match="pixels: expected one of auto, alike, differ, got 'both'"):
+        hsnoise.fit(counts, exposure_s=1.0, pixels="both")
+    with pytest.raises(ValueError, match="stack: pixel transfer needs the frames"):
+        hsnoise.fit(hsnoise.summarise(hsnoise.FrameStack(counts, 1.0)), method="transfer")
+
+
+@pytest.mark.parametrize("fano", [1.0, 0.8, 0.5])
+def test_hot_pixels_have_the_fano_factor_that_is_asked_for(fano):
+    effects = [ShotNoise(), HotPixels(1.0, 60.0, 0.0, fano), Gain(1.0), ReadNoise(0.0), BlackLevel(0.0), ADC()]
+    model = hsnoise.NoiseModel(effects, cfa="mono", shutter="global", exposure_s=1.0)
+    x = np.asarray(hsnoise.sample_dark(jax.random.key(0), 300, (32, 32), model, sensor_key=jax.random.key(1)), float)
+    mean, variance = x.mean(0), x.var(0, ddof=1)
+    bright = mean > 20
+    ratio = variance[bright].sum() / mean[bright].sum()
+    error = ratio * np.sqrt(2 / (299 * bright.sum()))
+    assert abs(ratio - fano) < 5 * error + 0.5 * (1 - fano) / mean[bright].mean()
+
+
+@pytest.mark.parametrize("level", [1.0, 2.0, 3.0])
+def test_clipping_is_taken_off_the_moments(level, rng):
+    sigma, scatter = 4.0, 2.0
+    offsets = level * sigma + scatter * rng.standard_normal((20_000, 1))
+    counts = np.maximum(np.round(offsets + sigma * rng.standard_normal((20_000, 8))), 0)
+    mean, variance = counts.mean(), counts.var(1, ddof=1).mean()
+    assert clipped_moments(level * sigma, np.hypot(sigma, np.sqrt(1 / 12)), scatter) == pytest.approx(
+        (mean, variance), rel=0.02
+    )
+    found, noise, growth = unclipped(mean, variance, scatter)
+    assert found == pytest.approx(level * sigma, abs=0.15)
+    assert noise == pytest.approx(sigma**2 + 1 / 12, rel=0.03 * growth)
+
+
+@pytest.mark.data
+class TestRealSensors:
+    def test_stl_1001_darks_alone(self, shared_data):
+        with np.load(shared_data / "data" / "sbig_stl1001_ccd.npz") as arrays:
+            fit = hsnoise.fit([arrays["bias_m05C"], arrays["dark_m05C_060s"]], exposure_s=[0, 60])
+        assert fit.table["gain"][0] == pytest.approx(0.516, rel=0.03)  # by flat pairs
+        assert fit.table["hot_pixels.fano"][0] == pytest.approx(0.9, abs=0.03)
+        assert fit.trustworthy
+
+    def test_imx541_darks_tell_no_gain(self, shared_data):
+        path = shared_data / "data" / "imx541_mono_emva.npz"
+        stack = hsnoise.load(path, shutter="global", progress=False)
+        darks = stack.select(exposures=[i for i, kind in enumerate(stack.kind) if kind == "dark"])
+        object.__setattr__(darks, "elsewhere", None)
+        fit = hsnoise.fit(darks)
+        assert np.isnan(fit.table["gain"][0]) and np.isnan(fit.table["read_noise.sigma"][0])
+        assert "Read noise is 0.82" in fit.doubts[0]
+
+    def test_st8_darks_and_flats(self, shared_data):
+        fit = hsnoise.fit(hsnoise.load(shared_data / "data" / "sbig_st8_cc0", progress=False))
+        assert 1 / fit.table["gain"][0] == pytest.approx(2.69, rel=0.01)
+        assert fit.trustworthy
