@@ -37,7 +37,7 @@ def new_figure(width_in: float, height_in: float, title: str) -> Figure:
 def bend_axis(axes: Axes, near: float, low: float, high: float) -> None:
     """A horizontal axis that is linear within about `near` of 0 and logarithmic beyond, smoothly; plain numbers."""
     axes.set_xscale("asinh", linear_width=near)
-    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(max(-low, high, near))) + 1)
+    decades = 10.0 ** np.arange(np.floor(np.log10(near)) - 1, np.ceil(np.log10(max(-low, high, near))) + 1)
     apart, ticks = TICKS_APART * (np.arcsinh(high / near) - np.arcsinh(low / near)), [0.0]
     for x in (f * sign * d for f in (1, 5, 2) for sign in (1, -1) for d in decades[::-1]):
         if low <= x <= high and np.abs(np.arcsinh(np.array(ticks) / near) - np.arcsinh(x / near)).min() > apart:
