@@ -25,7 +25,7 @@ def deviations(records: Sequence[dict], name: str) -> np.ndarray:
 
 def figures(records: Sequence[dict]) -> dict[str, float]:
     """Of the fits of one kind: relative bias, rms and largest error of the gain; coverage of the 95 % intervals of the
-    values that were given; shares withheld (no value for the gain, or no fit at all) and trustworthy; seconds."""
+    values that were given; shares withheld (no value for the gain, or a refusal), broken and trustworthy; seconds."""
     gain = deviations(records, "gain")
     given = gain[np.isfinite(gain[:, 0]), 0]
     out = {
@@ -33,6 +33,7 @@ def figures(records: Sequence[dict]) -> dict[str, float]:
         "rms": np.sqrt((given**2).mean()) if given.size else np.nan,
         "worst": np.abs(given).max() if given.size else np.nan,
         "withheld": float(np.mean([withheld(record) for record in records])),
+        "broke": float(np.mean([record["broke"] is not None for record in records])),
         "trustworthy": float(np.mean([record["trustworthy"] for record in records])),
         "seconds": float(np.median([record["seconds"] for record in records])),
     }
@@ -44,14 +45,28 @@ def figures(records: Sequence[dict]) -> dict[str, float]:
 
 
 def withheld(record: dict) -> bool:
-    """Whether the fit gave no gain: NaN in the table, or a ValueError instead of a table."""
+    """Whether the fit said that there is no gain: NaN in the table, or a refusal instead of a table."""
+    if record["broke"] is not None:
+        return False
     gains = [value for name, (value, _) in record["table"].items() if name.split(".")[0] == "gain"]
     return not np.isfinite(gains).any()
 
 
 def determined(records: dict[str, list[dict]]) -> Sheet:
     """One line a kind whose gain follows from its darks, all kinds together, and the goals."""
-    headings = ("kind", "bias", "rms", "worst", "gain", "read noise", "dark current", "withheld", "trust", "time")
+    headings = (
+        "kind",
+        "bias",
+        "rms",
+        "worst",
+        "gain",
+        "read noise",
+        "dark current",
+        "withheld",
+        "broke",
+        "trust",
+        "time",
+    )
     sheet = Sheet("Gain from darks: error in %; share of 95 % intervals that cover; shares of fits", headings)
     everything = [record for of_kind in records.values() for record in of_kind]
     for kind, of_kind in (*records.items(), ("all", everything)):
@@ -62,32 +77,33 @@ def determined(records: dict[str, list[dict]]) -> Sheet:
                 *(percent(f[name], "+.2f" if name == "bias" else ".2f") for name in ("bias", "rms", "worst")),
                 *(percent(f[f"cover {name}"]) for name in ("gain", "read_noise.sigma", MEAN_DARK)),
                 percent(f["withheld"]),
+                percent(f["broke"]),
                 percent(f["trustworthy"]),
                 f"{f['seconds']:.1f} s",
             )
         )
-    sheet.rows.append(("must", "", "", "5", *["90 to 98"] * 3, "0", "", ""))
-    sheet.rows.append(("aim", "", "2", "", *["93 to 97"] * 3, "", "", ""))
+    sheet.rows.append(("must", "", "", "5", *["90 to 98"] * 3, "0", "0", "", ""))
+    sheet.rows.append(("aim", "", "2", "", *["93 to 97"] * 3, "", "", "", ""))
     return sheet
 
 
 def undetermined(records: dict[str, list[dict]]) -> Sheet:
     """One line a capture from which no gain follows, and the goal."""
-    headings = ("kind", "called so", "of these refused", "gains given", "trust", "time")
+    headings = ("kind", "called so", "of these refused", "broke", "gains given", "trust", "time")
     sheet = Sheet("No gain follows from these frames", headings)
     for kind, of_kind in records.items():
-        given = [r["table"]["gain"] for r in of_kind if not withheld(r)]
+        given = [r["table"]["gain"] for r in of_kind if r["table"] and not withheld(r)]
         sheet.rows.append(
             (
                 kind,
                 f"{sum(map(withheld, of_kind))} of {len(of_kind)}",
-                str(sum(r["refused"] is not None for r in of_kind)),
+                *(str(sum(r[how] is not None for r in of_kind)) for how in ("refused", "broke")),
                 ", ".join(f"{value:.3g} ± {error:.2g}" for value, error in given[:3]) or "none",
                 percent(np.mean([r["trustworthy"] for r in of_kind])),
                 f"{np.median([r['seconds'] for r in of_kind]):.1f} s",
             )
         )
-    sheet.rows.append(("must", "all", "", "none", "", ""))
+    sheet.rows.append(("must", "all", "", "0", "none", "", ""))
     return sheet
 
 

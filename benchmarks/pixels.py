@@ -41,12 +41,15 @@ KNOWN = ("exposure_s", "black_level", "white_level", "cfa", "shutter")
 def one_fit(kind: str, seed: int, method: str) -> dict:
     """A record: what was fitted and what is true of one simulated capture."""
     drawn = draw(KINDS[kind], np.random.default_rng([zlib.crc32(kind.encode()), seed]))
-    record = {"kind": kind, "seed": seed, "method": method, "refused": None, "table": {}, "truth": {}, "doubts": []}
+    record = {"kind": kind, "seed": seed, "method": method, "refused": None, "broke": None, "trustworthy": False}
+    record |= {"table": {}, "truth": {}, "doubts": []}
     began = time.perf_counter()
     try:
         fit = hsnoise.fit(drawn["counts"], method=method, **{name: drawn[name] for name in KNOWN})
+    except np.linalg.LinAlgError as failure:  # a ValueError, but no refusal: nobody meant it for the user
+        return record | {"broke": str(failure), "seconds": time.perf_counter() - began}
     except ValueError as refusal:
-        return record | {"refused": str(refusal), "trustworthy": False, "seconds": time.perf_counter() - began}
+        return record | {"refused": str(refusal), "seconds": time.perf_counter() - began}
     return record | {
         "seconds": time.perf_counter() - began,
         "trustworthy": bool(fit.trustworthy),
@@ -131,7 +134,7 @@ def main() -> None:
     for name in ("seeds", "workers"):
         if getattr(arguments, name) < 1:
             parser.error(f"--{name}: expected at least 1, got {getattr(arguments, name)}")
-    console = Console(width=140)
+    console = Console(width=160)
     if arguments.real:
         console.print(real_sensors(data_folder(), arguments.only).rich())
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,10 +27,9 @@ def effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]],
             f"effect {name!r} is not built into hsnoise; pass its class: NoiseModel.load(path, effects=[MyEffect])."
         )
     specs = classes[name].specs()
-    optional = {f.name for f in dataclasses.fields(classes[name]) if f.default is not dataclasses.MISSING}
-    given = set(item["parameters"])
-    if given - set(specs) or set(specs) - given - optional:
-        raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(given)}.")
+    given, needed = set(item["parameters"]), set(specs) - classes[name].with_default()
+    if not needed <= given <= set(specs):  # a file may be older than a parameter that has a default
+        raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(item['parameters'])}.")
     values = {}
     for field, spec in ((field, spec) for field, spec in specs.items() if field in given):
         value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]

@@ -72,6 +72,18 @@ def _fit_arguments(commands: Any) -> None:
         "--model", help="model.json whose effects are fitted, those of a story, say (default: the paper's model)"
     )
     _method_argument(fit)
+    fit.add_argument(
+        "--pixels",
+        choices=("auto", "alike", "differ"),
+        default="auto",
+        help="whether pixels are pooled as if alike, or fitted each by itself (default: a test on the frames decides)",
+    )
+    fit.add_argument(
+        "--maps",
+        type=Path,
+        metavar="FILE",
+        help="write offset, dark current, noise and flags of each pixel: .fits, .npz",
+    )
     _capture_arguments(fit)
 
 
@@ -112,15 +124,19 @@ def _loop_arguments(commands: Any) -> None:
             "--report", type=Path, metavar="FILE", help="write one page of HTML, figures included: report.html"
         )
         parser.add_argument("--seed", type=int, default=0, help="of the model's samples (default 0)")
+        if name == "improve":
+            parser.add_argument("--max-minutes", type=float, metavar="M", help="look for nothing more after so long")
+            parser.add_argument("--max-steps", type=int, metavar="N", help="add no more effects than this")
         _capture_arguments(parser)
 
 
 def _method_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
-        choices=("auto", "ml", "line"),
+        choices=("auto", "ml", "line", "transfer"),
         default="auto",
-        help="ml: maximum likelihood; line: the paper's line fit; auto (default): ml, or else line",
+        help="ml: maximum likelihood; line: the paper's line fit; transfer: each pixel over time; auto (default): ml, or "
+        "transfer where pixels differ",
     )
 
 

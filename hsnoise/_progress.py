@@ -15,7 +15,9 @@ from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
 
-def fit_with_progress(stack: FrameStack, method: str, model: NoiseModel | None = None) -> FitResult:
+def fit_with_progress(
+    stack: FrameStack, method: str, model: NoiseModel | None = None, pixels: str = "auto"
+) -> FitResult:
     """`hsnoise.fit` with a bar while frames are read."""
     console = Console(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -27,7 +29,7 @@ def fit_with_progress(stack: FrameStack, method: str, model: NoiseModel | None =
             if progress.finished:
                 progress.add_task("Fitting", total=None)
 
-        return fit(stack, model=model, method=method, progress=tick)
+        return fit(stack, model=model, method=method, pixels=pixels, progress=tick)
 
 
 @contextmanager

@@ -31,6 +31,7 @@ from hsnoise.stack import FrameStack
 
 DEMO_EXPOSURES_S, DEMO_FRAMES, DEMO_SHAPE, DEMO_SEED = (0.05, 0.1, 0.2, 0.4), 8, (96, 160), 0
 DEMO_HIDDEN = RowNoise(1.5)
+DEMO_MINUTES = 5.0  # for frames of a user's own
 
 OPTIONS = {
     "exposure_s": "--exposure",
@@ -107,8 +108,11 @@ def _demo(args: argparse.Namespace) -> None:
     else:
         stack, truth, source = *_simulated(args.out), {"simulated": "canon_5d3 with row noise", "seed": DEMO_SEED}
     args.out.mkdir(parents=True, exist_ok=True)
+    if truth is None and not _can_be_improved(stack, args.out, source):
+        return
     print(f"{stack}\nFitting them, finding what the model lacks, and fitting again: a few minutes ...")
-    story = _improve_with_progress(stack, DEMO_SEED, args.out, source)
+    limit = None if truth is not None else DEMO_MINUTES
+    story = _improve_with_progress(stack, DEMO_SEED, args.out, source, max_minutes=limit)
     _tell(story, args.out, source, truth)
     if truth is not None:
         print("off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read")
@@ -116,6 +120,16 @@ def _demo(args: argparse.Namespace) -> None:
         print(f"Hidden in these frames was {DEMO_HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
     print(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
+
+
+def _can_be_improved(stack: FrameStack, out: Path, source: dict[str, Any]) -> bool:
+    """Fit a user's frames and print the result; False where they do not determine the gain, and no loop makes sense."""
+    fit = fit_with_progress(stack, "auto")
+    written = _write_results(fit, out, source)
+    print(stack)
+    _tell_fit(fit, Console(highlight=False, soft_wrap=True))
+    print(f"Written to {out}/: {', '.join(written)}\n")
+    return not fit.withheld
 
 
 def _simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
@@ -145,15 +159,25 @@ def _fit(args: argparse.Namespace) -> None:
     console, out = Console(highlight=False, soft_wrap=True), args.out
     out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     console.print(str(stack), markup=False)
-    fit = fit_with_progress(stack, args.method, model)
-    console.print(table_of(fit))
-    console.print(f"{TITLES[fit.method]}: {fit.outcome}", markup=False)
-    for note in fit.notes:
-        console.print(f"- {note}", style="yellow", markup=False)
-    written = _write_results(fit, out, {"files": args.paths}, figures=fit.method != "synthetic")
+    fit = fit_with_progress(stack, args.method, model, args.pixels)
+    written = _write_results(fit, out, {"files": args.paths})
+    if args.maps is not None:
+        fit.pixels.save(args.maps)
+        written.append(str(args.maps))
+    _tell_fit(fit, console)
     console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
     compare = f"hsnoise compare {args.paths[0]}{' ...' if args.paths[1:] else ''} --model {out / 'model.json'}"
     console.print(MEANING.format(LOOK[fit.method].format(compare)), markup=False)
+
+
+def _tell_fit(fit: FitResult, console: Console, truth: NoiseModel | None = None) -> None:
+    """Print a fit: what is doubtful first, then the table, how it ended, and what it does not determine."""
+    for doubt in fit.doubts:
+        console.print(f"! {doubt}", style="bold red" if fit.grave else "yellow", markup=False)
+    console.print(table_of(fit, truth))
+    console.print(f"{TITLES[fit.method]}: {fit.outcome}", markup=False)
+    for note in fit.notes:
+        console.print(f"- {note}", style="yellow", markup=False)
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -188,7 +212,8 @@ def _improve(args: argparse.Namespace) -> None:
     stack = _load(args)
     args.out.mkdir(parents=True, exist_ok=True)
     start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
-    story = _improve_with_progress(stack, args.seed, args.out, source, start)
+    limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
+    story = _improve_with_progress(stack, args.seed, args.out, source, start, **limits)
     _tell(story, args.out, source, None)
     _write_report(args, story, stack)
 
@@ -203,10 +228,7 @@ def _keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
 def _tell(story: Story, out: Path, source: dict[str, Any], truth: NoiseModel | None) -> None:
     """Print the story and its last fit, and write both."""
     _show(story, out / "story.png")
-    console = Console(highlight=False)
-    console.print(table_of(story.fit, truth))
-    for note in story.fit.notes:
-        console.print(f"- {note}", style="yellow", markup=False)
+    _tell_fit(story.fit, Console(highlight=False, soft_wrap=True), truth)
     print(f"Written to {out}/: {', '.join(_keep(story, out, source))}")
 
 
@@ -222,12 +244,12 @@ def _load(args: argparse.Namespace) -> FrameStack:
 
 
 def _improve_with_progress(
-    stack: FrameStack, seed: int, out: Path, source: dict[str, Any], start: NoiseModel | None = None
+    stack: FrameStack, seed: int, out: Path, source: dict[str, Any], start: NoiseModel | None = None, **limits: Any
 ) -> Story:
     """The loop; each model that it keeps is written to `out`."""
     with busy("Fitting the first model") as say:
         return hsnoise.improve(
-            stack, model=start, seed=seed, progress=say, keep=lambda story: _keep(story, out, source)
+            stack, model=start, seed=seed, progress=say, keep=lambda story: _keep(story, out, source), **limits
         )
 
 
@@ -270,6 +292,9 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
         **source,
         "method": fit.method,
         "outcome": fit.outcome,
+        "trustworthy": fit.trustworthy,
+        "doubts": list(fit.doubts),
+        "withheld": list(fit.withheld),
         "standard_errors": {name: error for name, (_, error, _) in fit.table.items() if 0 < error < np.inf},
     }
     fit.params.save(out / "model.json", provenance=provenance)
@@ -279,14 +304,10 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
     # 0: held, not fitted; inf: not determined.
     writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.table.items())
     write_atomically(out / "table.csv", text.getvalue().encode())
-    drawings = {"photon_transfer.png": plots.photon_transfer} if figures else {}
-    if figures and fit.summary.histograms:
-        drawings["histograms.png"] = plots.histograms
-        if fit.physics.row_sigma is not None:
-            drawings["row_spectrum.png"] = plots.row_spectrum
-    for name, figure_of in drawings.items():
-        write_figure(out / name, figure_of(fit))
-    return ["model.json", "table.csv", *drawings]
+    drawings = plots.of_fit(fit) if figures else {}
+    for name, figure in drawings.items():
+        write_figure(out / f"{name}.png", figure)
+    return ["model.json", "table.csv", *(f"{name}.png" for name in drawings)]
 
 
 RUN = {

@@ -18,10 +18,13 @@ PRIOR_SIGMA = {
     "exponent": 2.0,
     "dark_current": 300.0,
     "row_sigma": 300.0,
+    "white_share": 300.0,
     "outliers": 4.0,
 }
 EXPONENT_PRIOR = 0.5
-BOUNDED = ("dark_current", "row_sigma")
+BOUNDED = ("dark_current", "row_sigma", "white_share")  # at 0
+LARGEST = {"white_share": 1.0}  # of the bounded ones that end somewhere
+OFF_BOUNDS = 1e-9  # a share that is fitted stays this far from 0 and 1, where it would be held
 LOGARITHMIC = ("gain", "read_noise", "outliers")
 
 
@@ -29,19 +32,33 @@ class Coordinates(eqx.Module):
     """Maps the free fields of a Physics to a vector and back; each number depends on one coordinate only.
 
     Gain, read noise and outliers are logarithms; dark current and row gain, which may be zero, are softplus of their
-    value over a scale that the data resolve; exponent, black level and clamp are themselves.
+    value over a scale that the data resolve; so is the white share, which bends to its end at 1 in the same way;
+    exponent, black level and clamp are themselves.
     """
 
     base: Physics
     rate_scale: jax.Array
     sigma_scale: jax.Array
+    share_scale: jax.Array
     free: tuple[str, ...] = eqx.field(static=True)
 
-    @property
-    def bounded(self) -> list[int]:
-        """Places in the vector of parameters that may be zero."""
+    def inside(self, vector) -> np.ndarray:
+        """How far each coordinate is inside of its nearest bound [parameter]; below 0 its parameter hardly changes."""
+        low, high = self._bounds()
+        return np.minimum(np.asarray(vector) - low, high - np.asarray(vector))
+
+    def put_inside(self, vector, i: int, depth: float) -> np.ndarray:
+        """`vector` with its bounded coordinate i at `depth` inside of the bound that is nearest."""
+        (low, high), moved = self._bounds(), np.array(vector)
+        moved[i] = low[i] + depth if vector[i] - low[i] <= high[i] - vector[i] else high[i] - depth
+        return moved
+
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates from which on a parameter bends to its bounds [parameter]; infinite where there are none."""
+        low = [0.0 if name in BOUNDED else -np.inf for name in self.free]
+        high = [float(self._span(name)) if name in LARGEST else np.inf for name in self.free]
         sizes = [np.size(getattr(self.base, name)) for name in self.free]
-        return np.flatnonzero(np.repeat([name in BOUNDED for name in self.free], sizes)).tolist()
+        return np.repeat(low, sizes), np.repeat(high, sizes)
 
     def vector(self, physics: Physics) -> jax.Array:
         return jnp.concatenate([jnp.atleast_1d(self._forward(n, getattr(physics, n))) for n in self.free])
@@ -53,7 +70,7 @@ class Coordinates(eqx.Module):
         """How far each coordinate may go from `vector` before the rows' quadrature has to be planned anew."""
         names = np.repeat(self.free, [np.size(getattr(self.base, name)) for name in self.free])
         doubled = 5.0 + np.maximum(np.asarray(vector), 0.0)
-        fixed = {"black_level": np.inf, "black_clamp": np.inf, "dark_current": np.inf}
+        fixed = {name: np.inf for name in ("black_level", "black_clamp", "dark_current", "white_share")}
         return np.where(np.isin(names, ["row_sigma"]), doubled, [fixed.get(name, 2.0) for name in names])
 
     def slope(self, vector) -> jax.Array:
@@ -99,33 +116,48 @@ class Coordinates(eqx.Module):
         return Physics(**{**{f: getattr(self.base, f) for f in Physics.__dataclass_fields__}, **fields})
 
     def _scale(self, name):
-        return {"dark_current": self.rate_scale, "row_sigma": self.sigma_scale}[name]
+        scales = {"dark_current": self.rate_scale, "row_sigma": self.sigma_scale, "white_share": self.share_scale}
+        return scales[name]
+
+    def _span(self, name):
+        return LARGEST[name] / self._scale(name)
 
     def _forward(self, name, value):
         if name in LOGARITHMIC:
             return jnp.log(value)
         if name in BOUNDED:
             ratio = jnp.maximum(value / self._scale(name), 1e-6)
-            return ratio + jnp.log(-jnp.expm1(-ratio))
+            if name not in LARGEST:
+                return ratio + jnp.log(-jnp.expm1(-ratio))
+            left = jnp.maximum(self._span(name) - ratio, 1e-6)
+            return ratio + jnp.log(jnp.expm1(-ratio) / jnp.expm1(-left))
         return value
 
     def _inverse(self, name, x):
         if name in LOGARITHMIC:
             return jnp.exp(jnp.clip(x, -30.0, 30.0))
+        if name in LARGEST:
+            share = self._scale(name) * (jax.nn.softplus(x) - jax.nn.softplus(x - self._span(name)))
+            return jnp.clip(share, OFF_BOUNDS, LARGEST[name] - OFF_BOUNDS)
         if name in BOUNDED:
             return self._scale(name) * jax.nn.softplus(x)
         return x
 
 
 def coordinates_for(summary: Summary, start: Physics) -> Coordinates:
-    """The parameters that this capture lets move: no dark current without exposure, no exponent of white rows."""
+    """The parameters that this capture lets move.
+
+    No dark current without exposure, no exponent of white rows, no white share of 0 or 1.
+    """
     free = ["gain", "read_noise"]
     if summary.histograms and summary.exposure_s.any() and start.dark_current > 0:
         free.append("dark_current")
     if start.row_sigma is not None:
         free.append("row_sigma")
         if summary.shutter == "rolling" and summary.histograms:
-            free.append("exponent")
+            share = 0.0 if start.white_share is None else float(start.white_share)
+            free += ["exponent"] if share < 1 else []
+            free += ["white_share"] if 0 < share < 1 else []
     if summary.black_level_dn is None and summary.histograms:
         free.append("black_level")
     if start.black_clamp is not None:
@@ -139,6 +171,7 @@ def coordinates_for(summary: Summary, start: Physics) -> Coordinates:
         base=jax.tree.map(lambda x: np.asarray(x, np.float64), start),
         rate_scale=np.asarray(rate_scale, np.float64),
         sigma_scale=np.asarray(_row_gain_resolution(summary, start)),
+        share_scale=np.asarray(_share_resolution(summary)),
         free=tuple(free),
     )
 
@@ -159,11 +192,17 @@ def _row_gain_resolution(summary: Summary, start: Physics) -> float:
     return float(np.sqrt(min(smallest)))
 
 
+def _share_resolution(summary: Summary) -> float:
+    """The white share that just shows in the spectrum of rows without measurement noise."""
+    rows = sum(int((h.row_pixels > 0).sum()) for h in summary.histograms)
+    return 1 / np.sqrt(max(rows, 100))
+
+
 def labels(coordinates: Coordinates, channels: tuple[str, ...]) -> tuple[str, ...]:
     """Table names of the free parameters, in the order of `vector`."""
     named = {"gain": "gain", "read_noise": "read_noise.sigma", "dark_current": "dark_current.rate"}
     named |= {"row_sigma": "row_gain.sigma", "exponent": "row_gain.exponent", "black_level": "black_level"}
-    named |= {"black_clamp": "black_clamp.rate"}
+    named |= {"black_clamp": "black_clamp.rate", "white_share": "row_gain.white_share"}
     out = []
     for name in coordinates.free:
         if name == "outliers":

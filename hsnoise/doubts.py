@@ -16,7 +16,7 @@ from hsnoise.flat_notes import gain_notes
 from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
-from hsnoise.pixels.oddities import oddities_of
+from hsnoise.pixels.oddities import oddities_of, pixels_apart
 from hsnoise.pixels.structure import can_be_transferred, has_patterns, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
@@ -27,6 +27,7 @@ APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two 
 HEADER_SHARE = 0.08  # of a gain that a header states
 BLACK_SIGMAS, BLACK_DN = 5.0, 0.25
 OFF_LINE = 3.0  # chi2 per degree of freedom
+MANY_OUTLIERS = 3e-3  # share of pixels
 STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
 
 
@@ -87,17 +88,13 @@ def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResu
 
 def checked(result: FitResult, found: Survey) -> FitResult:
     """The result with its doubts, and the notes of what it does not determine."""
-    doubts = tuple(
-        dict.fromkeys(
-            sentence
-            for check in (_withheld, _of_transfer, _of_pooling, _stated_gain, _black_level, _mosaic, _odd)
-            for sentence in check(result, found)
-        )
-    )
+    checks = (_withheld, _of_transfer, _of_pooling, _stated_gain, _black_level, _mosaic, _odd)
+    grave = [sentence for check in checks for sentence in check(result, found)]
+    doubts = tuple(dict.fromkeys([*grave, *pixels_apart(found), *_outliers(result)]))
     notes = result.notes
     if result.method == "transfer":
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
-    return replace(result, doubts=doubts, notes=notes)
+    return replace(result, doubts=doubts, grave=bool(grave), notes=notes)
 
 
 def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
@@ -162,6 +159,19 @@ def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
             yield (
                 f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
                 " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
+            )
+
+
+def _outliers(result: FitResult) -> Iterator[str]:
+    """Pixels that were set apart because some frame of theirs holds an outlier."""
+    pixel = result.transfer
+    for channel in pixel.channels if pixel is not None else ():
+        share = 0.0 if channel.transfer is None else float(channel.transfer.classes.outlier_share.max())
+        if share > MANY_OUTLIERS:
+            of = "" if channel.name == "mono" else f" of {channel.name}"
+            yield (
+                f"{100 * share:.2g} % of the pixels{of} hold an outlier in some frame (cosmic rays, telegraph jumps):"
+                " they were set apart."
             )
 
 

@@ -20,7 +20,7 @@ from hsnoise.maximise import maximise
 from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
-from hsnoise.physics import Physics, flat_gain_of, physics_of
+from hsnoise.physics import Physics, flat_gain_of
 from hsnoise.pixel_fit import measure
 from hsnoise.pixel_result import POPULATION, result_of
 from hsnoise.pixels.structure import can_be_transferred, pixels_differ
@@ -70,8 +70,9 @@ def fit(
             shutter, kind, ...) an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays
             [frame, row, column], one an exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
-            not used. Default: all of the paper's. Effects beyond the paper's are fitted by simulated statistics,
-            together with all others (`hsnoise.synthetic`); their values are where the search starts.
+            not used, but for `row_gain.white_share`: 0 and 1 are held, and any other is where the search for it starts.
+            Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
+            statistics, together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "transfer" pixel
             transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", which the result then
             says. With effects beyond the paper's it is that of the fit which the simulated statistics start from.
@@ -101,11 +102,15 @@ def fit(
         check_fits(model, source, "model")  # before the frames are read
     extra = () if model is None else without_likelihood(model)
     found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
-    differ = found is not None and _is_conditional(found, method, pixels)
-    if set(extra) - set(POPULATION if differ else ()):
-        return _with_effects(source, model, extra, method, pixels, progress)
+    measurable = found is not None and (model is None or "black_clamp" not in model)
+    differ = measurable and _is_conditional(found, method, pixels)
+    simulated = tuple(name for name in extra if not (differ and name in POPULATION))
+    if simulated:
+        return _with_effects(source, model, simulated, method, pixels, progress)
+    if model is not None:
+        _check_complete(model)
     summary = source if isinstance(source, Summary) else _summary_of(source, progress)
-    if differ or found is not None and pixels == "auto" and carries_no_gain(found, summary, method):
+    if differ or measurable and pixels == "auto" and carries_no_gain(found, summary, method):
         return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), found)
     result = _pooled(summary, model, method)
     if found is None or method == "line":
@@ -115,10 +120,13 @@ def fit(
 
 def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:
     """The exact likelihood, or the line fit, of pixels that are all alike."""
-    with_row_gain = model is None or _check_model(model)
+    with_row_gain = model is None or "row_gain" in model
     with_clamp = model is not None and "black_clamp" in model
     if with_clamp:
         _check_clamp(summary, method)
+    white_share = _white_share(model)
+    if white_share is not None and method == "line":
+        raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
             "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
@@ -128,6 +136,9 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         summary = _with_judged_flats(summary, start)
         if model is not None and "dark_current" not in model:
             start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
+        if white_share is not None:
+            exponent = start.exponent if white_share < 1 else np.asarray(0.0)
+            start = replace(start, white_share=white_share, exponent=exponent)
         if method == "line":
             return _by_line(summary, model, "the paper's line fit, as asked")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
@@ -140,7 +151,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         if converged:
             return result
         why = result.outcome.removeprefix(NOT_CONVERGED)
-        if method == "ml" or with_clamp:
+        if method == "ml" or with_clamp or white_share is not None:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
         return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
 
@@ -219,14 +230,19 @@ def _check_copies(summary: Summary) -> None:
     check_no_copies((prints(e, n) for e, n in enumerate(summary.n_frames)), summary.exposure_s)
 
 
-def _check_model(model: NoiseModel) -> bool:
-    """Whether it has a row gain. Raises ValueError for a model that cannot be fitted."""
+def _check_complete(model: NoiseModel) -> None:
+    """Raise ValueError for a model without the effects that every fit has."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
         raise ValueError(f"model: has no {', '.join(missing)}, without which it cannot be fitted")
-    with jax.enable_x64(True):
-        physics_of(model)  # raises for effects without a likelihood
-    return "row_gain" in model
+
+
+def _white_share(model: NoiseModel | None) -> np.ndarray | None:
+    """That of a model's row gain; None for 0."""
+    if model is None or "row_gain" not in model:
+        return None
+    share = np.asarray(model["row_gain"].white_share, np.float64)
+    return share if share > 0 else None
 
 
 def _check_clamp(summary: Summary, method: str) -> None:
@@ -327,10 +343,11 @@ def _covariance(information: np.ndarray) -> np.ndarray:
 
 def _model_with(physics: Physics, summary: Summary, model: NoiseModel | None) -> NoiseModel:
     """A NoiseModel of the fitted values; its default exposure is the median one of the darks."""
+    white_share = 0.0 if physics.white_share is None else physics.white_share
     values = {
         "dark_current": lambda: DarkCurrent(physics.dark_current),
         "read_noise": lambda: ReadNoise(physics.read_noise),
-        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent),
+        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent, white_share),
         "gain": lambda: Gain(physics.gain),
         "black_level": lambda: BlackLevel(physics.black_level),
         "black_clamp": lambda: BlackClamp(jnp.maximum(physics.black_clamp, 0.0)),

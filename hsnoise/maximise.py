@@ -147,16 +147,15 @@ def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, 
 
 
 def _off_bounds(coordinates, vector, value, gradient_anew) -> np.ndarray:
-    """`vector`, with parameters taken off their bound of zero where the likelihood is higher above it.
+    """`vector`, with parameters taken off their bound where the likelihood is higher above it.
 
     At the bound it is flat in their coordinates, whether it rises beyond or not: a search that once got there stays.
     """
     ahead = np.array(vector)
-    for i in coordinates.bounded:
-        end = np.array(vector)
-        end[i] = OFF_BOUND
-        if vector[i] < IDLE_BELOW and gradient_anew(end)[0][0] > value + WORTH_NATS:
-            ahead[i] = OFF_BOUND
+    for i in np.flatnonzero(_idle(coordinates, vector)):
+        end = coordinates.put_inside(vector, i, OFF_BOUND)
+        if gradient_anew(end)[0][0] > value + WORTH_NATS:
+            ahead[i] = end[i]
     return ahead
 
 
@@ -327,10 +326,8 @@ def _curvature(coordinates, vector, whiten, gradients_at):
 
 
 def _idle(coordinates, vector) -> np.ndarray:
-    """Coordinates of parameters at their bound of zero, so far out that nothing changes."""
-    idle = np.zeros(len(vector), bool)
-    idle[coordinates.bounded] = np.asarray(vector)[coordinates.bounded] < IDLE_BELOW
-    return idle
+    """Coordinates of parameters at a bound, so far out that nothing changes."""
+    return coordinates.inside(vector) < IDLE_BELOW
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -343,24 +340,25 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     """Information on the parameters themselves, from the whitening of the coordinates.
 
-    A parameter at its bound of zero (no dark current, no row gain) has a coordinate far out where nothing changes; its
-    row is measured between two positive values within what the data resolve. `gradient_anew` plans the rules for a
-    point: the nodes for rows without gain all lie at 1.
+    A parameter at a bound (no dark current, no row gain, a white share of 0 or 1) has a coordinate far out where
+    nothing changes; its row is measured between two values off the bound within what the data resolve. `gradient_anew`
+    plans the rules for a point: the nodes for rows without gain all lie at 1.
     """
     slope = np.asarray(_parameters(coordinates, vector)[2])
     active = ~_idle(coordinates, vector)
     inverse = np.linalg.inv(slope[active, None] * whiten[np.ix_(active, active)])
     information = np.zeros((len(vector), len(vector)))
     information[np.ix_(active, active)] = inverse.T @ inverse
-    at_bound = [i for i in coordinates.bounded if vector[i] < 0]
+    at_bound = np.flatnonzero(coordinates.inside(vector) < 0).tolist()
     for i in at_bound:
-        ends = np.repeat(np.asarray(vector)[None], 2, axis=0)
-        ends[:, i] = (0.0, 1.5)
+        ends = [coordinates.put_inside(vector, i, depth) for depth in (0.0, 1.5)]
         gradients = [gradient_anew(end)[1][0] for end in ends]
         at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends)
         values, slopes = zip(*(map(np.asarray, at_end[1:3]) for at_end in at_ends), strict=True)
         low, high = (np.asarray(g) / s for g, s in zip(gradients, slopes, strict=True))
         row = -(high - low) / (values[1][i] - values[0][i])
+        if row[i] <= 0:
+            row[i] = low[i] ** 2  # falls from the bound like an exponential law, whose deviation is 1 / slope
         alone = np.where(np.arange(len(row)) == i, row, 0.0)
         coupled = np.where(np.isin(np.arange(len(row)), at_bound), alone, row)
         # Measured over a range, the couplings may contradict the rest: then they are left out.

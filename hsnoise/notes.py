@@ -66,7 +66,9 @@ def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | 
     if parameter == "row_gain.sigma" and value < 4 * error:
         return f"{near_zero(name, value, error)}."
     if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
-        return f"{name} is not determined: the row gain is too weak here to have a spectrum."
+        return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
+    if parameter == "row_gain.white_share" and name in result.names and error > 0.1:
+        return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
     if parameter == "black_level" and name in result.names and error > 1.0:
         known = "" if np.isinf(error) else f" ({error:.2g} DN)"
         return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."

@@ -34,6 +34,7 @@ class Physics(eqx.Module):
     outliers [exposure]: fraction of pixels that follow no such law (hot pixels, cosmic hits) and may hold any count;
     None for none. It keeps them from bending the estimates of all the others.
     black_clamp [channel]: DN that the camera subtracts for each second of exposure; None for none.
+    white_share: white part of the variance of a rolling shutter's row gain; None for none.
     """
 
     gain: jax.Array
@@ -44,6 +45,7 @@ class Physics(eqx.Module):
     black_level: jax.Array
     outliers: jax.Array | None = None
     black_clamp: jax.Array | None = None
+    white_share: jax.Array | None = None
 
 
 class Block(eqx.Module):
@@ -100,6 +102,7 @@ def physics_of(model: NoiseModel) -> Physics:
         exponent=f64(0.0) if row_gain is None else f64(row_gain.exponent),
         black_level=f64(model["black_level"].value) if "black_level" in model else jnp.zeros(n, jnp.float64),
         black_clamp=f64(model["black_clamp"].rate) if "black_clamp" in model else None,
+        white_share=None if row_gain is None else f64(row_gain.white_share),
     )
 
 
@@ -137,7 +140,7 @@ def rows_log_likelihood(physics: Physics, rule: RowRule, laws, summary: Summary)
         of_rows = rows.Curves(tuple(curves), layout)
         if summary.shutter == "global":
             return rows.log_evidence_white(of_rows, sigma**2)
-        spectrum = rows.row_spectrum(physics.exponent, summary.shape[0], rule.row_stride, sigma.dtype)
+        spectrum = rows.row_spectrum(physics.exponent, summary.shape[0], rule.row_stride, physics.white_share)
         return rows.log_evidence_coloured(of_rows, sigma**2 * spectrum).sum()
 
     at = binning(summary, laws, rule.channel, rule.exposure, rule.edges_dn, rule.outlier_law)

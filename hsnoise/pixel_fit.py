@@ -30,6 +30,7 @@ PATTERNS = {
     "column_x_frame": "column_noise",
 }
 DETERMINED = 0.35  # relative standard error up to which a gain is a number
+MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that jump as if a signal grew
 ROW_GAIN_THERE = 3.0
 ROUNDS = 30
 UNKNOWN = 1e6  # relative error of what is not known
@@ -85,6 +86,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     estimate, covariance = _joint(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
+    known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
     return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
 
 
@@ -165,6 +167,9 @@ def _temporal(found: Survey, c: int) -> tuple[float, float]:
         return 0.0, UNKNOWN
     group = min(groups, key=lambda g: g.exposure_s)
     variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.planes if p.channel == c]).astype(np.float64)
+    variance = variance[~found.stuck(c)]
+    if not (variance > 0).any():
+        return 0.0, UNKNOWN
     typical = float(np.median(variance)) + 1e-6
     kept = variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (group.n_frames - 1))) ** 2]
     return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
@@ -177,7 +182,7 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     level = np.array([np.mean([np.median(p.row_mean_dn) for p in g.planes if p.channel == c]) for g in darks])
     frames = [np.mean([p.frame_means_dn for p in g.planes if p.channel == c], axis=0) for g in darks]
     scatter = np.sqrt(np.mean([of.var(ddof=1) for of in frames if len(of) > 1] or [1.0]))
-    error = np.array([scatter / np.sqrt(len(of)) for of in frames])
+    error = np.array([max(scatter, 1e-6) / np.sqrt(len(of)) for of in frames])
     if np.ptp(t) == 0:
         mean_error = float(1 / np.sqrt((error**-2.0).sum()))
         return (0.0, UNKNOWN), (float(level.mean()), mean_error if t.max() == 0 else UNKNOWN)
@@ -203,7 +208,7 @@ def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
     signal = growth * np.array([g.exposure_s for g in groups])
     parts = [[p.components["row_x_frame"] for p in g.planes if p.channel == c] for g in groups]
     y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
-    error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts])
+    error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
     if len(groups) < 2 or np.ptp(signal) <= 0:
         return 0.0, UNKNOWN
     design = np.stack([np.ones_like(signal), signal**2], 1) / error[:, None]

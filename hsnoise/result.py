@@ -45,6 +45,7 @@ class FitResult:
         summary: the row histograms and photon transfer that were fitted.
         physics: the same parameters as `hsnoise.physics` takes them.
         doubts: sentences on what disagrees, and on what is withheld; printed above the table.
+        grave: whether one of them says that a parameter may be wrong; others tell what was set apart.
         withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
             DN then (gain 1 DN/e-), so that darks are still drawn with the right noise.
         added: effects of `params` that the fit put in because the pixels differ.
@@ -63,6 +64,7 @@ class FitResult:
     summary: Summary
     physics: Physics
     doubts: tuple[str, ...] = ()
+    grave: bool = False
     withheld: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     transfer: Any = None
@@ -71,7 +73,7 @@ class FitResult:
     @property
     def trustworthy(self) -> bool:
         """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
-        return self.converged and not self.doubts and not self.withheld
+        return self.converged and not self.grave and not self.withheld
 
     @cached_property
     def pixels(self) -> PixelMaps:
@@ -121,9 +123,6 @@ class FitResult:
 
     def with_notes(self, notes: tuple[str, ...]) -> FitResult:
         return replace(self, notes=notes)
-
-    def with_doubts(self, doubts: tuple[str, ...]) -> FitResult:
-        return replace(self, doubts=doubts)
 
     def expected_histograms(self) -> tuple[np.ndarray, ...]:
         """Counts that the model expects in the bins of `summary.histograms`: for each channel [exposure, bin]."""

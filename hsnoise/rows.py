@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, logsumexp
 
+from hsnoise._coloured import row_gain_power
+
 ITERATIONS = 80
 WHOLE_STEPS = 20  # later ones are shortened, against going round in circles
 # Steps converge quadratically: after one as long as this, in deviations of a row, a hundredth of it is left. The
@@ -181,15 +183,13 @@ def log_evidence_white(rows: Curves, variance):
     return rows.log_evidence(ones, variance * ones).sum()
 
 
-def row_spectrum(exponent, sensor_rows: int, stride: int, dtype):
-    """Eigenvalues of the correlation of a coloured row gain, for a colour that uses every `stride`-th sensor row.
+def row_spectrum(exponent, sensor_rows: int, stride: int, white_share=None):
+    """Eigenvalues of the correlation of a row gain, for a colour that uses every `stride`-th sensor row.
 
-    Power k^-exponent at |frequency| k = 1 .. rows/2, none at k = 0, unit variance; every second row of a circulant
-    process is circulant again with its spectrum folded.
+    They are the spectrum that `row_gain` is drawn with, of unit variance; every second row of a circulant process is
+    circulant again with its spectrum folded.
     """
-    k = jnp.abs(jnp.fft.fftfreq(sensor_rows, 1 / sensor_rows)).astype(dtype)
-    power = jnp.where(k == 0, 0.0, jnp.exp(-exponent * jnp.log(jnp.maximum(k, 1.0))))
-    power = power * (sensor_rows / power.sum())
+    power = row_gain_power(sensor_rows, exponent, white_share)
     return power.reshape(stride, sensor_rows // stride).mean(0)
 
 

@@ -153,6 +153,7 @@ class Problem:
             ("read_noise", "sigma"): physics.read_noise,
             ("row_gain", "sigma"): physics.row_sigma,
             ("row_gain", "exponent"): physics.exponent,
+            ("row_gain", "white_share"): physics.white_share,
             ("black_level", "value"): physics.black_level,
             ("black_clamp", "rate"): None if physics.black_clamp is None else np.maximum(physics.black_clamp, 0),
         }

@@ -15,9 +15,9 @@ from benchmarks._real_folders import COVERED, REAL, Known, judged, unpacked
 from benchmarks.pixel_simulator import draw
 
 
-def record(gain, error, *, truth=2.0, trustworthy=True, refused=None):
-    table = {} if refused else {"gain": [gain, error], "read_noise.sigma": [3.0, 0.0]}
-    about = {"refused": refused, "trustworthy": trustworthy, "seconds": 1.0, "truth": {"gain": truth}}
+def record(gain, error, *, truth=2.0, trustworthy=True, refused=None, broke=None):
+    table = {} if refused or broke else {"gain": [gain, error], "read_noise.sigma": [3.0, 0.0]}
+    about = {"refused": refused, "broke": broke, "trustworthy": trustworthy, "seconds": 1.0, "truth": {"gain": truth}}
     return about | {"table": table, "doubts": []}
 
 
@@ -28,12 +28,29 @@ def test_figures_of_gains_are_relative_and_their_coverage_counted():
     assert np.isnan(f["cover mean dark current"])
 
 
-def test_refused_and_nan_are_both_withheld():
-    records = [record(np.nan, np.nan), record(0, 0, refused="one exposure"), record(1.2, 0.3)]
-    assert [withheld(r) for r in records] == [True, True, False]
+def test_refused_and_nan_are_both_withheld_and_a_fit_that_broke_is_not():
+    records = [
+        record(np.nan, np.nan),
+        record(0, 0, refused="one exposure"),
+        record(1.2, 0.3),
+        record(0, 0, broke="SVD"),
+    ]
+    assert [withheld(r) for r in records] == [True, True, False, False]
     row = undetermined({"bias only": records}).rows[0]
-    assert row[1:4] == ("2 of 3", "1", "1.2 ± 0.3")
-    assert determined({"CCD warm": records}).rows[0][0] == "CCD warm (3)"
+    assert row[1:5] == ("2 of 4", "1", "1", "1.2 ± 0.3")
+    assert determined({"CCD warm": records}).rows[0][0] == "CCD warm (4)"
+
+
+@pytest.mark.parametrize(
+    ("error", "kept_as"), [(ValueError("one"), "refused"), (np.linalg.LinAlgError("one"), "broke")]
+)
+def test_refusals_are_told_from_failures(monkeypatch, error, kept_as):
+    def fit(*_, **__):
+        raise error
+
+    monkeypatch.setattr(hsnoise, "fit", fit)
+    of_one = pixels.one_fit("bias only", 0, "auto")
+    assert of_one[kept_as] == "one" and not of_one["trustworthy"] and not of_one["table"]
 
 
 def fitted(hot: bool):
@@ -82,6 +99,8 @@ def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 0.05, "yes"),
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 0.03, "no"),
         (Known("gain", 0.5, 0.52, COVERED), 0.6, 10.0, "no"),
+        (Known("gain", 0.5, 0.52, 0.02), 0.51, 10.0, "no"),
+        (Known("share", 0.5, 0.52, 0.02), 0.51, np.nan, "yes"),
         (Known("gain", 0.5, 0.52, 0.02), np.nan, np.inf, "no"),
         (Known("gain", np.nan, np.nan), np.nan, np.inf, "yes"),
         (Known("gain", np.nan, np.nan), 0.5, 0.01, "no"),

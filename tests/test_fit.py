@@ -14,6 +14,7 @@ import pytest
 import hsnoise
 from hsnoise import maximise as maximise_module
 from hsnoise import statistics
+from hsnoise._types import unit_in_words
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.model import sample_dark
 from hsnoise.moments import start_physics
@@ -67,7 +68,7 @@ def test_printed_result_holds_every_parameter_with_its_error(canon_fit):
     text = str(result)
     for name, (_, _, unit) in result.table.items():
         line = next(line for line in text.splitlines() if f" {name} " in line)
-        assert unit in line
+        assert unit_in_words(unit) in line
     assert "converged" in text and "held" in text
 
 

@@ -198,6 +198,7 @@ def test_table_names_values_and_units():
         "row_gain.sigma.G": (0.039**0.5, "1"),
         "row_gain.sigma.B": (0.013**0.5, "1"),
         "row_gain.exponent": (1.0, "1"),
+        "row_gain.white_share": (0.0, "1"),
         "gain.R": (1.53, "DN/e-"),
         "gain.G": (1.23, "DN/e-"),
         "gain.B": (1.31, "DN/e-"),
@@ -205,9 +206,8 @@ def test_table_names_values_and_units():
         "black_level.G": (0.0, "DN"),
         "black_level.B": (0.0, "DN"),
     }
-    assert list(mono().table()) == [
-        "dark_current.rate", "read_noise.sigma", "row_gain.sigma", "row_gain.exponent", "gain", "black_level",
-    ]  # fmt: skip
+    names = "dark_current.rate read_noise.sigma row_gain.sigma row_gain.exponent row_gain.white_share gain black_level"
+    assert list(mono().table()) == names.split()
 
 
 # File

@@ -45,13 +45,23 @@ def test_white_rows_match_adaptive_quadrature(sigma, width):
 
 
 def test_spectrum_has_unit_variance_no_dc_and_folds_like_taking_every_second_row():
-    full = np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, 1, jnp.float64))
+    full = np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, 1))
     np.testing.assert_allclose(full.mean(), 1.0)
     assert full[0] == 0
     np.testing.assert_allclose(full[1] / full[4], 4.0)
-    folded = np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, 2, jnp.float64))
+    folded = np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, 2))
     covariance = np.fft.ifft(full).real
     np.testing.assert_allclose(np.fft.ifft(folded).real, covariance[::2], atol=1e-12)
+
+
+def test_a_white_share_adds_to_every_frequency_and_folds_to_itself():
+    full, folded = (
+        np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, stride, share)) for stride, share in ((1, 0.25), (2, 0.25))
+    )
+    coloured = np.asarray(rows.row_spectrum(jnp.float64(1.0), 64, 1))
+    np.testing.assert_allclose(full, 0.75 * coloured + 0.25)
+    np.testing.assert_allclose(np.fft.ifft(folded).real, np.fft.ifft(full).real[::2], atol=1e-12)
+    np.testing.assert_allclose(rows.row_spectrum(jnp.float64(1.0), 64, 2, 1.0), 1.0)
 
 
 def dense_log_evidence(y, variance, covariance):
@@ -72,7 +82,7 @@ def test_coloured_rows_match_the_dense_gaussian(sigma, exponent, noise, mean):
     """
     n, frames = 160, 6
     rng = np.random.default_rng(1)
-    spectrum = sigma**2 * np.asarray(rows.row_spectrum(jnp.float64(exponent), n, 1, jnp.float64))
+    spectrum = sigma**2 * np.asarray(rows.row_spectrum(jnp.float64(exponent), n, 1))
     covariance = np.fft.ifft(np.fft.fft(np.eye(n), axis=0) * spectrum[:, None], axis=0).real
     beta = 1 + rng.multivariate_normal(np.zeros(n), covariance, frames)
     variance = (noise * beta) ** 2 * rng.uniform(0.7, 1.4, beta.shape)
@@ -109,7 +119,7 @@ def test_gradient_of_coloured_rows_needs_no_derivative_of_the_iteration():
     curves = jnp.asarray(-0.5 * ((np.asarray(nodes.beta) - centres) / (0.1 * np.maximum(centres, 0.3))) ** 2)
 
     def value(theta):
-        spectrum = theta[0] ** 2 * rows.row_spectrum(theta[1], 64, 1, jnp.float64)
+        spectrum = theta[0] ** 2 * rows.row_spectrum(theta[1], 64, 1)
         return rows.log_evidence_coloured(one_group(theta[2] * curves, nodes), spectrum).sum()
 
     theta = jnp.array([0.3, 0.8, 1.0])
@@ -169,7 +179,7 @@ def test_groups_blocks_and_empty_places_change_nothing_for_coloured_rows(exponen
     grouped, plain = grouped_and_not()
 
     def evidence(sigma, curves):
-        spectrum = sigma**2 * rows.row_spectrum(jnp.float64(exponent), 40, 1, jnp.float64)
+        spectrum = sigma**2 * rows.row_spectrum(jnp.float64(exponent), 40, 1)
         return rows.log_evidence_coloured(curves, spectrum)
 
     ours, slope = evidence(jnp.float64(0.2), grouped), jax.jacfwd(evidence)(jnp.float64(0.2), grouped)

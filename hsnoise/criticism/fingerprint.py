@@ -125,4 +125,7 @@ def _moved_models(model: NoiseModel) -> list[NoiseModel]:
             models.append(model.with_value(name, what, changed))
     if "row_gain" in model and model.shutter == "rolling":
         models.append(model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05))
+        share = float(model["row_gain"].white_share)
+        if 0 < share < 1:
+            models.append(model.with_value("row_gain", "white_share", min(share + 0.05, 1.0)))
     return models

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hsnoise._arguments import callback, counter, seed_of
+from hsnoise._arguments import callback, counter, seed_of, whole_number
+from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
@@ -35,7 +37,16 @@ UNFINISHED = "Not finished: whether something is missing was being looked for."
 
 
 def improve(
-    stack, *, model: NoiseModel | None = None, candidates: Any = (), seed: int = 0, progress=None, keep=None, **keywords
+    stack,
+    *,
+    model: NoiseModel | None = None,
+    candidates: Any = (),
+    max_minutes: float | None = None,
+    max_steps: int | None = None,
+    seed: int = 0,
+    progress=None,
+    keep=None,
+    **keywords,
 ) -> Story:
     """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
 
@@ -46,6 +57,8 @@ def improve(
         stack: FrameStack, or a bare array with FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
+        max_minutes: after which no further effect is looked for; None: as long as it takes.
+        max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
         seed: of all draws. progress: called with a sentence at each stage, and again, with a colon and a number behind
             it, after each capture that is drawn. keep: called with the story so far, after each model that is kept, so
             that nothing is lost.
@@ -57,12 +70,14 @@ def improve(
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = split_frames(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
+    limit = _Limit.of(max_minutes, max_steps)
     work, split = _Work(fitted, held_out, seed, say), told_of(fitted, held_out)
     say("Fitting the first model")
     steps = work.begun(fit(fitted, model=model))
+    measured = len(steps)
     while True:
-        if len(steps) > MOST_STEPS:
-            return Story(tuple(steps), f"It stopped after {MOST_STEPS} additions; something may be left.", split)
+        if reached := limit.reached(len(steps) - measured):
+            return Story(tuple(steps), f"It stopped after {reached}; something may be left.", split)
         last = steps[-1]
         keep(Story(tuple(steps), UNFINISHED, split))
         own = [c for c in candidates if c.name not in last.fit.params]
@@ -78,6 +93,30 @@ def improve(
         if step is None:
             return Story(tuple(steps), _left_out(refused, found, last.comparison), split)
         steps.append(step)
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """When the loop ends whatever is left: the time, s, and the number of additions."""
+
+    began_s: float
+    minutes: float
+    steps: int
+
+    @staticmethod
+    def of(max_minutes: float | None, max_steps: int | None) -> _Limit:
+        """Raises ValueError for limits that are none."""
+        minutes = np.inf if max_minutes is None else float(max_minutes)
+        if not minutes > 0:
+            raise ValueError(f"max_minutes: expected minutes above 0, got {max_minutes}")
+        steps = MOST_STEPS if max_steps is None else whole_number("max_steps", max_steps, 0)
+        return _Limit(time.monotonic(), minutes, steps)
+
+    def reached(self, additions: int) -> str:
+        """Which limit is reached, in words; empty if none."""
+        if additions >= self.steps:
+            return f"{additions} additions"
+        return f"{self.minutes:g} minutes" if time.monotonic() - self.began_s > 60 * self.minutes else ""
 
 
 @dataclass(frozen=True)

@@ -283,6 +283,12 @@ class AbstractEffect(eqx.Module):
         return {name: spec for name, spec in declared.items() if spec is not None}
 
     @classmethod
+    def with_default(cls) -> set[str]:
+        """Declared parameters that need not be given."""
+        without = dataclasses.MISSING
+        return {f.name for f in dataclasses.fields(cls) if "parameter" in f.metadata and f.default is not without}
+
+    @classmethod
     def about(cls) -> str:
         """What it is: the first line of its docstring."""
         return (cls.__doc__ or "").strip().partition("\n")[0]
@@ -348,32 +354,3 @@ def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
 def step_from_previous(signal: Frames) -> Frames:
     """Each pixel less the one read before it in its row, of whatever colour; 0 for the first of a row."""
     return signal - jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)
-
-
-GAIN_DC_UNTIL = 0.3  # row gain that is nearly white has a mean, that of the paper's 1/f has none
-
-
-def coloured_normal(
-    key: RandomKey, shape: tuple[int, int, int], exponent: Scalar, dtype: jnp.dtype, *, dc_until: float = 1.0
-) -> jax.Array:
-    """Normal series along axis 1 of `shape`, of variance 1 over the axis on average and power k^-exponent.
-
-    A series is a stationary periodic Gaussian process with independent periodogram bins, k = 1 ... n/2 cycles per
-    axis, and has no DC term. With exponent 0 it is independent normals instead, DC included. In between the DC term
-    fades out with |exponent|, until `dc_until`: an estimate, which is never quite 0, meets no jump.
-    """
-    white = jax.random.normal(key, shape, dtype)
-    spectrum = jnp.fft.rfft(white, axis=1) * _colour_filter(shape[1], exponent, dc_until)[None, :, None]
-    return jnp.fft.irfft(spectrum, n=shape[1], axis=1)
-
-
-def _colour_filter(n: int, exponent: Scalar, dc_until: float) -> jax.Array:
-    """Amplitudes at k = 0 ... n//2 that turn a white series of n into a coloured one of the same variance."""
-    # Amplitudes, not powers: the square root of a zero power at DC would have a NaN gradient.
-    k = jnp.minimum(jnp.arange(n), n - jnp.arange(n))
-    coloured = jnp.maximum(k, 1).astype(exponent.dtype) ** (-exponent / 2)
-    dc = jnp.maximum(1 - jnp.abs(exponent) / dc_until, 0)
-    amplitude = jnp.where(k > 0, coloured, dc)
-    mean_power = jnp.mean(amplitude**2)
-    # A single row has only the DC term, so a coloured series over it is 0.
-    return amplitude[: n // 2 + 1] / jnp.sqrt(jnp.where(mean_power > 0, mean_power, 1))

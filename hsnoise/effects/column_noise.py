@@ -7,8 +7,9 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
+from hsnoise._coloured import coloured_normal, fading_power
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 
 class ColumnNoise(AbstractEffect):
@@ -35,5 +36,5 @@ class ColumnNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, _, columns = signal.shape
-        series = coloured_normal(key, (frames, columns, 1), self.exponent, signal.dtype)
+        series = coloured_normal(key, (frames, columns, 1), fading_power(columns, self.exponent), signal.dtype)
         return signal + capture.offset(self.sigma * jnp.swapaxes(series, 1, 2), self.after_gain)

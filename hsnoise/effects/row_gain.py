@@ -6,18 +6,24 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from hsnoise._coloured import coloured_normal, row_gain_power
 from hsnoise._types import Frames, PerChannel, RandomKey, Scalar
-from hsnoise.effects._base import GAIN_DC_UNTIL, AbstractEffect, Capture, Stage, coloured_normal, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 
 class RowGain(AbstractEffect):
     """Gain max(beta, 0) of each row, one series beta[frame, row, channel] of mean 1 per colour and frame.
 
-    A series runs over all sensor rows; a colour uses the rows it has. It is a stationary periodic Gaussian
-    process with independent periodogram bins of mean power proportional to k^-exponent, k = 1 ... rows/2
-    cycles per frame, scaled so that its variance over rows is sigma^2 on average over frames; it has no DC
-    term. With exponent 0, and with a global shutter whatever the exponent, rows are independent
-    Normal(1, sigma^2) instead, DC included; the DC term fades out until an exponent of 0.3.
+    A series runs over all sensor rows; a colour uses the rows it has. With a rolling shutter it is a stationary
+    periodic Gaussian process whose independent periodogram bins k = 0 ... rows/2 (cycles per frame) have a mean power
+    of sigma^2 times
+
+        (1 - white_share) c_k + white_share,   c_k proportional to k^-exponent, c_0 = 0, of mean 1 over the rows:
+
+    coloured noise without a DC term, so that its mean over the rows of a frame is 1, whatever the exponent; and a share
+    of white noise, which has one (the paper's beta is a mixture of 1/f and white noise). The variance is sigma^2. With
+    a global shutter, and with a white share of 1, rows are independent Normal(1, sigma^2). A fit moves the white share
+    only where the model that it is given has one between 0 and 1.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
@@ -27,13 +33,15 @@ class RowGain(AbstractEffect):
     stage: ClassVar[Stage] = Stage.GAIN
     sigma: PerChannel = param("1", low=0, per_channel=True, doc="standard deviation of the gain over rows")
     exponent: Scalar = param("1", doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
+    white_share: Scalar = param(
+        "1", low=0, high=1, default=0.0, held="at bounds", doc="share of the variance that is white; fits hold 0 and 1"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(
-            key, (frames, rows, len(capture.channels)), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL
-        )
+        white_share = jnp.where(capture.shutter == "global", 1.0, self.white_share)
+        power = row_gain_power(rows, self.exponent, white_share)
+        series = coloured_normal(key, (frames, rows, len(capture.channels)), power, signal.dtype)
         # The clip stands between product and sum: no program may merge them, each rounds alike.
         beta = 1 + jnp.maximum(self.sigma[None, None] * series, -1)
         return signal * capture.per_row(beta)

@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import equinox as eqx
 
+from hsnoise._coloured import coloured_normal, fading_power
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, coloured_normal, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 
 class RowNoise(AbstractEffect):
@@ -35,5 +36,5 @@ class RowNoise(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        offset = self.sigma * coloured_normal(key, (frames, rows, 1), self.exponent, signal.dtype)
+        offset = self.sigma * coloured_normal(key, (frames, rows, 1), fading_power(rows, self.exponent), signal.dtype)
         return signal + capture.offset(offset, self.after_gain)

@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from hsnoise._coloured import coloured_normal, row_gain_power
 from hsnoise._types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import GAIN_DC_UNTIL, AbstractEffect, Capture, Stage, coloured_normal, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 
 class SharedRowGain(AbstractEffect):
@@ -30,7 +31,8 @@ class SharedRowGain(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frames, rows, _ = signal.shape
-        exponent = jnp.where(capture.shutter == "global", 0, self.exponent)
-        series = coloured_normal(key, (frames, rows, 1), exponent, signal.dtype, dc_until=GAIN_DC_UNTIL)
+        white_share = 1.0 if capture.shutter == "global" else None
+        power = row_gain_power(rows, self.exponent, white_share)
+        series = coloured_normal(key, (frames, rows, 1), power, signal.dtype)
         # The clip stands between product and sum, as in row_gain.
         return signal * (1 + jnp.maximum(self.sigma * series, -1))

@@ -16,12 +16,17 @@ from hsnoise.pixels.survey import Survey
 
 BODY = (0.0, 0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)  # quantiles between which ordinary pixels are classed
 TAIL = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 0.9999)
+FEWEST_ALIVE = 200  # pixels of a colour that is not dead
 FEWEST_PIXELS = 20  # of a class
 FAR_FRAME, MANY_FRAMES = 5.0, 6  # deviations of an odd frame; frames whose scatter is known by themselves
 JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure from which pedestals jump between exposures
 FEWEST_FRAMES = 3  # of an exposure that can be halved
 OUTLIER_SIGMAS = 6.0  # a half of a pixel's frames with such a deviation holds a cosmic hit, or a telegraph jump
 LEAST_SCALE_DN = 0.5
+MANY_PIXELS, MANY_TIMES = (
+    500,
+    20.0,
+)  # whose scatter is known; of the median variance: beyond it no noise of the same kind
 FILLED = 0.7  # of full scale: above it the response may bend
 HOT_TIMES, HOT_SIGMAS = 3.0, 6.0  # of the median growth, of the chance scatter of a growth: beyond both a pixel is hot
 NEAR_ZERO_SIGMAS = 4.0  # above 0 counts from which clipping takes nothing from the noise
@@ -84,6 +89,8 @@ def levels_of(found: Survey, channel: int) -> Levels | None:
         np.stack([np.concatenate([getattr(h, name) for h in of], 1)[:, moving] for of in halves])
         for name in ("level_dn", "variance_dn2", "peak_dn")
     )
+    if moving.sum() < FEWEST_ALIVE:
+        return None
     whole = np.stack([np.concatenate([h.pair_variance_dn2 for h in of])[moving] for of in halves])
     sigma = _pedestal_sigmas([np.mean([h.frame_means_dn for h in of], axis=0) for of in halves])
     sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
@@ -105,6 +112,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
                 pixels.peak[:, half],
                 pixels.level[:, 1 - half],
                 t,
+                (pixels.n_frames + 1 - half) // 2 - 1,
                 full_scale_dn,
             )
             for half in measuring
@@ -116,7 +124,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         peak = np.sqrt(pixels.whole_variance * (pixels.n_frames[:, None] - 1))
         members = _members(mean, _edges(mean, limit, False))
         level = pixels.level.mean(1)
-        parts = [_measured(members, level, pixels.whole_variance, peak, level, t, full_scale_dn)]
+        parts = [_measured(members, level, pixels.whole_variance, peak, level, t, pixels.n_frames - 1, full_scale_dn)]
         grown = [mean]
     level, variance, error, count, apart = (np.concatenate(x) for x in zip(*[p[:-1] for p in parts], strict=True))
     hot = np.concatenate([[g[m].mean() > limit for m in p[-1]] for g, p in zip(grown, parts, strict=True)])
@@ -156,7 +164,7 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
         near.append(of[off <= FAR_FRAME * 1.4826 * np.median(off)] if len(of) > 3 else of)
         scatter.append(near[-1].var(ddof=1) if len(near[-1]) > 1 else 0.0)
     dof = np.array([len(of) - 1 for of in near])
-    pooled = float(dof @ scatter / max(dof.sum(), 1))
+    pooled = float(dof @ scatter / max(dof.sum() - 2, 1))  # of few frames, as wide as Student's t
     found = []
     for of, own in zip(offsets, scatter, strict=True):
         half = len(of) // 2
@@ -202,14 +210,16 @@ def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
     return [inside for inside in np.split(order, bounds) if len(inside) >= FEWEST_PIXELS]
 
 
-def _measured(members: list[np.ndarray], level, variance, peak, other, t, full_scale_dn: float):
+def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, full_scale_dn: float):
     """Level, variance, its error [class, exposure], pixels [class], outliers [class, exposure]; the members.
 
-    level, variance, peak [exposure, pixel]: in the frames that measure; other: levels in those that chose.
+    level, variance, peak [exposure, pixel]: in the frames that measure; other: levels in those that chose. dof
+    [exposure]: degrees of freedom of a pixel's variance.
     """
     size = (len(members), len(level))
     mean, spread, error, apart = np.zeros(size), np.ones(size), np.full(size, np.inf), np.zeros(size)
     ordinary = np.median(level, axis=1)
+    floor = np.median(variance, axis=1)
     scatter = _level_scatter(members, level, other, t)
     for c, inside in enumerate(members):
         for e in range(len(level)):
@@ -223,13 +233,27 @@ def _measured(members: list[np.ndarray], level, variance, peak, other, t, full_s
             if spread[c, e] <= 0:
                 spread[c, e] = 1.0
                 continue
-            error[c, e] = v[kept].std(ddof=1) / np.sqrt(kept.sum())
+            error[c, e] = _chance_error(v[kept], other[e, inside][kept] - ordinary[e], floor[e], dof[e])
             if np.quantile(y, 0.001) < NEAR_ZERO_SIGMAS * np.sqrt(spread[c, e]):
                 mean[c, e], spread[c, e], growth = unclipped(mean[c, e], spread[c, e], scatter[c, e])
                 error[c, e] *= growth
     lost = ~np.isfinite(mean)
     mean[lost], spread[lost] = 0.0, 1.0
     return mean, spread, error, np.array([len(m) for m in members], float), apart, members
+
+
+def _chance_error(variance: np.ndarray, excess: np.ndarray, floor: float, dof: int) -> float:
+    """Standard error of the mean variance of a class [pixel] by chance.
+
+    In a class of few pixels a mean that is low by chance scatters less, too, and would count more: there the error is
+    that of normal noise of the class's mean. Brighter pixels (excess [pixel], in other frames) have more of it.
+    """
+    if len(variance) > MANY_PIXELS:
+        return float(variance.std(ddof=1) / np.sqrt(len(variance)))
+    mean, share = float(variance.mean()), excess / max(float(excess.mean()), 1e-9)
+    each = np.maximum(floor + (mean - floor) * share, 0.1 * mean) if mean > 2 * floor else np.full(1, mean)
+    square = float((each.astype(np.float64) ** 2).mean())
+    return float(np.sqrt(2 * square / (max(dof, 1) * len(variance))))
 
 
 def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
@@ -245,14 +269,17 @@ def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
 def _level_scatter(members: list[np.ndarray], level, other, t) -> np.ndarray:
     """Standard deviation of the levels of the pixels of each class at each exposure [class, exposure], DN.
 
-    Of offsets, as ordinary pixels show them at the brightest exposure, and of the growth that differs within a class.
+    As measured in large classes; of few pixels, offsets as in the largest class, and the growth that differs between
+    them as their brightest exposure shows it.
     """
-    brightest = int(np.argmax(level.mean(1)))
-    found = np.array([_scatter(level[brightest, m], other[brightest, m]) for m in members])
-    offsets = found[int(np.argmax([len(m) for m in members]))]
-    of_growth = np.maximum(found**2 - offsets**2, 0)
+    measured = np.array([[_scatter(one[m], of[m]) for one, of in zip(level, other, strict=True)] for m in members])
+    count = np.array([len(m) for m in members])
+    brightest, shortest = int(np.argmax(level.mean(1))), int(np.argmin(t))
+    offsets = measured[int(np.argmax(count)), shortest]
+    of_growth = np.maximum(measured[:, brightest] ** 2 - offsets**2, 0)
     share = (t / max(t[brightest], 1e-30)) ** 2
-    return np.sqrt(offsets**2 + of_growth[:, None] * share)
+    scaled = np.sqrt(offsets**2 + of_growth[:, None] * share)
+    return np.where(count[:, None] > MANY_PIXELS, measured, scaled)
 
 
 def _scatter(one: np.ndarray, other: np.ndarray) -> float:

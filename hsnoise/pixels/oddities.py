@@ -11,14 +11,14 @@ from hsnoise.pixels.survey import Group, Survey
 
 ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by which its noise differs from the others'
 LEAST_LEVEL_DN = 0.5
-MANY = {"stuck": 5e-4, "telegraph": 5e-3}  # shares of pixels that are worth a sentence
+MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that are worth a sentence
 QUIET = 0.05  # of the other colours' noise: a colour that is dead
 FEWEST = 3  # frames, of which one can be told to be odd
 
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
-    """What is wrong with frames, lines, pixels and colours, most important first."""
-    return (*_frames(found), *_lines(found), *_colours(found), *_pixels(found))
+    """What is wrong with frames, lines and colours, most important first."""
+    return (*_frames(found), *_lines(found), *_colours(found))
 
 
 def name_of(group: Group) -> str:
@@ -76,7 +76,8 @@ def _colours(found: Survey) -> Iterator[str]:
                 yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
 
 
-def _pixels(found: Survey) -> Iterator[str]:
+def pixels_apart(found: Survey) -> Iterator[str]:
+    """Shares of pixels that are no noise: stuck, dead, telegraph-like."""
     for c, channel in enumerate(found.channels):
         shares = counts_of(flags_of(found, c))
         of = "" if channel == "mono" else f" of channel {channel}"

@@ -80,8 +80,10 @@ class Survey:
         """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
         halves = [[p.halves for p in g.planes if p.channel == channel] for g in self.groups if g.n_frames > 1]
         still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
-        noisy = [bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves]
-        frames = sum(sum(of[0].n_frames) for of, loud in zip(halves, noisy, strict=True) if loud)
+        noisy: list[bool] = [
+            bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves
+        ]
+        frames = np.sum([of[0].n_frames for of, loud in zip(halves, noisy, strict=True) if loud])
         if frames < FEWEST_STILL:  # few may agree by chance
             return np.zeros(len(still[0]) if still else 0, bool)
         return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)

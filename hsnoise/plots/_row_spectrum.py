@@ -140,7 +140,8 @@ def _shape(physics: Physics, summary: Summary, histograms: RowHistograms) -> np.
         return np.ones(n_rows)
     with jax.enable_x64(True):
         sensor_rows = n_rows * histograms.row_stride
-        return np.asarray(rows.row_spectrum(float(physics.exponent), sensor_rows, histograms.row_stride, np.float64))
+        exponent = np.asarray(physics.exponent, np.float64)
+        return np.asarray(rows.row_spectrum(exponent, sensor_rows, histograms.row_stride, physics.white_share))
 
 
 def _bands(k: np.ndarray, power: np.ndarray, frames: int):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from hsnoise import rows as rows_module
 from hsnoise.effects import RowGain
 from hsnoise.model import NoiseModel, sample
 
@@ -16,9 +17,9 @@ FRAMES, ROWS = 400, 64
 P_VALUE = 1e-5
 
 
-def beta(sigma, exponent, *, cfa="mono", shutter="rolling", rows=ROWS, frames=FRAMES):
+def beta(sigma, exponent, white_share=0.0, *, cfa="mono", shutter="rolling", rows=ROWS, frames=FRAMES):
     """Row gains [frame, row, column] that a uniform signal of 1 shows."""
-    model = NoiseModel([RowGain(sigma, exponent)], cfa=cfa, shutter=shutter, exposure_s=0.05)
+    model = NoiseModel([RowGain(sigma, exponent, white_share)], cfa=cfa, shutter=shutter, exposure_s=0.05)
     return np.asarray(sample(KEY, np.ones((frames, rows, 2)), model))
 
 
@@ -69,9 +70,11 @@ def test_variance_over_rows_is_sigma_squared_on_average(exponent, shutter):
     assert abs(squares.mean() - expected) < 5 * squares.std() / np.sqrt(FRAMES)
 
 
-@pytest.mark.parametrize(("exponent", "shutter"), [(0.0, "global"), (1.0, "global"), (0.0, "rolling")])
-def test_white_rows_are_independent_normals(exponent, shutter):
-    z = (beta(0.1, exponent, shutter=shutter)[:, :, 0] - 1) / 0.1
+@pytest.mark.parametrize(
+    ("exponent", "white_share", "shutter"), [(0.0, 0.0, "global"), (1.0, 0.3, "global"), (1.0, 1.0, "rolling")]
+)
+def test_white_rows_are_independent_normals(exponent, white_share, shutter):
+    z = (beta(0.1, exponent, white_share, shutter=shutter)[:, :, 0] - 1) / 0.1
     assert stats.kstest(z.ravel(), "norm").pvalue > P_VALUE
     assert abs(np.mean(z[:, 1:] * z[:, :-1])) < 5 / np.sqrt(z.size)
     # With its DC term: the mean of a frame is Normal(1, sigma^2 / rows).
@@ -138,8 +141,38 @@ def test_a_single_rolling_row_has_gain_one():
     np.testing.assert_array_equal(beta(0.1, 1.0, rows=1, frames=3), 1.0)
 
 
-@pytest.mark.parametrize(("exponent", "least", "most"), [(0.0, 0.9, 1.1), (0.03, 0.72, 0.93), (0.3, 0.0, 1e-9)])
-def test_the_mean_of_nearly_white_rows_fades_without_a_jump(exponent, least, most):
-    """Estimates of exponent 0 are never quite 0; white rows have a frame mean of variance sigma^2 / rows."""
-    means = beta(0.1, exponent, frames=2000)[:, :, 0].mean(1)
-    assert least <= means.var() / (0.1**2 / ROWS) <= most
+LAWS = [*((exponent, 0.0) for exponent in (0.0, 0.05, 0.2, 0.29, 0.31, 0.5, 1.0)), (1.0, 0.3), (0.5, 0.9), (0.0, 0.4)]
+
+
+@pytest.mark.parametrize(("exponent", "white_share"), LAWS)
+@pytest.mark.parametrize("stride", [1, 2])
+def test_draws_have_the_spectrum_of_the_likelihood(exponent, white_share, stride):
+    """Each bin, DC too; of all rows, and of a colour that has every second one."""
+    drawn = (beta(0.05, exponent, white_share)[:, ::stride, 0] - 1) / 0.05
+    n = ROWS // stride
+    expected = np.asarray(rows_module.row_spectrum(jnp.float64(exponent), ROWS, stride, white_share))[: n // 2 + 1]
+    power = np.abs(np.fft.rfft(drawn, axis=1)) ** 2 / n
+    if stride == 1:
+        stated = (1 - white_share) * ROWS * powers(exponent) + white_share
+        np.testing.assert_allclose(expected, stated[: n // 2 + 1], atol=1e-12)
+    if expected[0] == 0:
+        np.testing.assert_allclose(power[:, 0], 0, atol=1e-20)
+        power, expected = power[:, 1:], expected[1:]
+    degrees = np.full(len(expected), 2)
+    degrees[-1] = 1  # the bins at DC and n/2 are real
+    degrees[0] = 1 if len(expected) > n // 2 else 2
+    z = ((power / expected).mean(0) - 1) / np.sqrt(2 / degrees / FRAMES)
+    assert stats.chi2.sf(np.sum(z**2), len(z)) > P_VALUE
+    assert np.abs(z).max() < 5
+
+
+@pytest.mark.parametrize("white_share", [0.0, 0.3])
+def test_white_share_has_the_gradient_of_finite_differences(white_share):
+    def energy(share, exponent=1.0):
+        model = NoiseModel([RowGain(0.05, exponent, share)], cfa="mono", shutter="rolling", exposure_s=0.05)
+        return jnp.sum(jnp.sin(40 * sample(KEY, np.ones((1, 16, 2)), model)))
+
+    assert np.isfinite(jax.grad(energy, argnums=1)(white_share, 1.0))
+    if white_share:
+        difference = (energy(white_share + 1e-5) - energy(white_share - 1e-5)) / 2e-5
+        np.testing.assert_allclose(jax.grad(energy)(white_share), difference, rtol=1e-6)
