@@ -191,7 +191,7 @@ def _ratio(axes: Axes, name: str, measured: np.ndarray, sampled: np.ndarray, edg
     axes.set_yscale("log")
     reach = float(np.clip(1.3 * np.exp(np.abs(np.log(ratio)).max(initial=0.0)), 2.0, MOST_RATIO))
     axes.set_ylim(1 / reach, reach)
-    ticks = [x for x in RATIOS if 1 / reach <= x <= reach]
+    ticks = [x for x in (RATIOS if reach < MOST_RATIO / 2 else RATIOS[::3]) if 1 / reach <= x <= reach]
     axes.set_yticks(ticks, [f"{x:g}" for x in ticks])
     axes.yaxis.set_minor_locator(NullLocator())
 
