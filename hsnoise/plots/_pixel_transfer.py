@@ -82,7 +82,7 @@ def draw_variances(axes: Axes, channels: list[tuple[str, Transfer]]) -> None:
     bend_axis(axes, near, min(-0.3 * near, 1.1 * float(x.min(initial=0.0))), FAR * float(x.max(initial=1e-6)))
     axes.set_yscale("log")
     axes.set_ylim(0.8 * y.min(), 1.4 * y.max())
-    plain_log(axes)
+    plain_log(axes.yaxis)
     axes.legend(fontsize=8.5, loc="upper left", framealpha=0.9)
     tidy(axes)
 

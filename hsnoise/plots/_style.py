@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
@@ -47,13 +48,13 @@ def bend_axis(axes: Axes, near: float, low: float, high: float) -> None:
     axes.set_xlim(low, high)
 
 
-def plain_log(axes: Axes) -> None:
-    """A vertical logarithmic axis with plain numbers, more than one in a decade where it spans few."""
-    low, high = axes.get_ylim()
+def plain_log(axis: Axis) -> None:
+    """Plain numbers on a logarithmic axis, more than one in a decade where it spans few."""
+    low, high = axis.get_view_interval()
     short = np.log10(high / low) < SHORT_DECADES
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
-    axes.yaxis.set_major_formatter(lambda y, _: f"{y:,g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
+    axis.set_major_formatter(lambda value, _: f"{value:,g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def tidy(axes: Axes) -> None:
