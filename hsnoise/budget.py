@@ -10,9 +10,8 @@ import numpy as np
 
 from hsnoise._arguments import callback
 from hsnoise._budget_table import printed
-from hsnoise._joining import replaced
 from hsnoise.decomposition import COMPONENTS, Component
-from hsnoise.draws import check_fits, draw_capture
+from hsnoise.draws import check_fits, draw_capture, middle_of
 from hsnoise.model import NoiseModel
 from hsnoise.pixels.classes import levels_of, slope_over
 from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
@@ -20,7 +19,6 @@ from hsnoise.pixels.survey import Group, Survey, survey
 from hsnoise.stack import FrameStack, as_stack
 
 TOP_SHARE, FEWEST_TOP = 1e-3, 10  # of the pixels, that are the tail
-MOST_DRAWN = (8, 320, 480)  # frames, rows and columns of a capture that is drawn from a model
 
 
 class TableRow(NamedTuple):
@@ -116,15 +114,7 @@ class NoiseBudget:
             TypeError, ValueError: a model of another sensor, or one that makes no counts.
         """
         check_fits(model, self.stack, "model")
-        frames, rows, columns = MOST_DRAWN
-        # What depends on the place stays where it is on the sensor.
-        whole = replaced(self.stack, window=self.stack.window or (0, 0, *self.stack.shape))
-        part = whole.select(
-            frames=slice(0, frames),
-            rows=_middle(self.stack.shape[0], rows),
-            columns=_middle(self.stack.shape[1], columns),
-        )
-        return budget(draw_capture(0, model, part))
+        return budget(draw_capture(0, model, middle_of(self.stack)))
 
     def plot(self, model: NoiseModel | None = None) -> Any:
         """Figure of `hsnoise.plots.budget`: the components, with `model` its own beside them."""
@@ -182,12 +172,6 @@ def budget_of(found: Survey, stack: FrameStack) -> NoiseBudget:
     for c, name in enumerate(found.channels):
         pixels.update({(name, what): one for what, one in _spreads(found, c).items()})
     return NoiseBudget(rows, _growth(rows), pixels, flags, found, stack)
-
-
-def _middle(size: int, most: int) -> slice:
-    """At most `most` of a side, even at both ends."""
-    first = max((size - most) // 4 * 2, 0)
-    return slice(first, min(first + most, size))
 
 
 def _row(found: Survey, group: Group, channel: int) -> BudgetRow:

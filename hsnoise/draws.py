@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from hsnoise._arguments import check_no_copies
+from hsnoise._joining import replaced
 from hsnoise._keys import named_key
 from hsnoise._types import cfa_tile
 from hsnoise.effects import Stage
@@ -19,6 +20,7 @@ from hsnoise.structure import check_size
 
 MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
 FAR_OFF = 5.0  # deviations from which a statistic counts less
@@ -54,6 +56,27 @@ def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> Fra
     # What depends on the place stays where it is on the sensor.
     window = part.window or ((0, first, rows, columns) if end - first < columns else None)
     return part.with_counts(counts, window)
+
+
+def middle_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> FrameStack:
+    """The middle of a few frames of each exposure, nothing read: enough for a look at how pixels differ.
+
+    Raises ValueError where there is no exposure of these kinds.
+    """
+    chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
+    if not chosen:
+        raise ValueError(f"stack: expected {' or '.join(kinds)} frames, and there are none")
+    frames, rows, columns = MIDDLE
+    # What depends on the place stays where it is on the sensor.
+    whole = replaced(stack, window=stack.window or (0, 0, *stack.shape))
+    spans = [_middle(size, most) for size, most in zip(stack.shape, (rows, columns), strict=True)]
+    return whole.select(frames=slice(0, frames), exposures=chosen, rows=spans[0], columns=spans[1])
+
+
+def _middle(size: int, most: int) -> slice:
+    """At most `most` of a side, even at both ends."""
+    first = max((size - most) // 4 * 2, 0)
+    return slice(first, min(first + most, size))
 
 
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:

@@ -110,6 +110,11 @@ def test_one_dark_exposure_has_no_transfer():
             draw(fit)
 
 
+def test_small_frames_have_figures():
+    fit = hsnoise.fit(captured().select(rows=(0, 24), columns=(0, 96)), pixels="differ")
+    assert {"histograms", "dark_current", "pixel_map"} <= set(plots.of_fit(fit))
+
+
 def test_pixel_transfer_shows_the_line_and_the_gain_of_the_fit():
     fit = fitted()
     (_, transfer), *_ = transfers_of(fit)

@@ -157,4 +157,4 @@ def _shares(axes: Axes, sides: list[list]) -> None:
 
 
 def _exposure(row) -> str:
-    return f"{'flat ' if row.kind == 'flat' else ''}{seconds(row.exposure_s)}"
+    return f"flat of {row.mean_dn:.5g} DN" if row.kind == "flat" else seconds(row.exposure_s)

@@ -15,7 +15,7 @@ from hsnoise.moments import binned_moments
 from hsnoise.physics import Physics, black_level_at, flat_gain_of
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
-from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, tidy, title_of
+from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, plain_log, tidy, title_of
 from hsnoise.statistics import RowHistograms, Summary, far_outliers
 
 CLIPPED_FRACTION = 1e-3
@@ -118,6 +118,8 @@ def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    plain_log(axes.xaxis)
+    plain_log(axes.yaxis)
     axes.legend(fontsize=9, framealpha=0.9)
 
 
@@ -139,6 +141,7 @@ def _gains(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.plot([], [], "-", color="0.3", label="curve of the variance")
     axes.plot([], [], "--", color="0.3", label="local gain")
     axes.set_xscale("log")
+    plain_log(axes.xaxis)
     _gain_limits(axes, found)
     axes.legend(fontsize=9, framealpha=0.9)
 

@@ -14,7 +14,7 @@ from hsnoise.result import rounded
 CURVE_POINTS = 200
 FAR = 1.25  # times the largest signal: the end of the axis
 TELLING = 0.5  # relative error up to which the gain of one class is shown
-NEAR = 0.2  # quantile of the signals below which the axis is linear
+CHANCE, NEAR = 0.1, 0.2  # quantiles of all signals, and of those above 0, within which the axis is linear
 MOST_ERRORS = 3.0  # of the gain: beyond it a single class is out of the picture
 
 
@@ -82,7 +82,7 @@ def draw_variances(axes: Axes, channels: list[tuple[str, Transfer]]) -> None:
     bend_axis(axes, near, min(-0.3 * near, 1.1 * float(x.min(initial=0.0))), FAR * float(x.max(initial=1e-6)))
     axes.set_yscale("log")
     axes.set_ylim(0.8 * y.min(), 1.4 * y.max())
-    plain_log(axes)
+    plain_log(axes.yaxis)
     axes.legend(fontsize=8.5, loc="upper left", framealpha=0.9)
     tidy(axes)
 
@@ -119,7 +119,7 @@ def _with_error(gain: float, error: float) -> str:
 def _near(x: np.ndarray) -> float:
     """Signal below which the axis is linear: small ones, and what chance makes of none."""
     small = float(np.quantile(x[x > 0], NEAR)) if (x > 0).any() else 1.0
-    return max(small, -2 * float(x.min(initial=0.0)))
+    return max(small, -2 * float(np.quantile(x, CHANCE)))
 
 
 def _used(transfer: Transfer) -> np.ndarray:

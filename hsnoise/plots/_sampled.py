@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from hsnoise._types import cfa_tile, seconds
-from hsnoise.draws import darks_of, draw_capture
+from hsnoise.draws import draw_capture, middle_of
 from hsnoise.pixels.classes import growth_noise, levels_of, slope_over
 from hsnoise.pixels.survey import survey
 from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
@@ -24,13 +24,13 @@ WIDE = 3.0  # times the core, from which an axis is bent
 
 
 def drawn_beside(fit) -> tuple[FrameStack, FrameStack]:
-    """The darks of a fit, cut to what can be drawn quickly, and frames drawn from its model as these were taken.
+    """The middle of a fit's darks, and frames drawn from its model as these were taken.
 
     Raises ValueError for a fit without frames or darks.
     """
     if fit.stack is None:
         raise ValueError("fit: this figure needs the frames of the fit, and it was made from a Summary")
-    part = darks_of(fit.stack)
+    part = middle_of(fit.stack, ("dark",))
     return part, draw_capture(0, fit.params, part)
 
 
@@ -40,7 +40,7 @@ def dark_current(fit) -> Figure:
     Dark current of a pixel is the growth of its level with exposure. Chance moves that, too: the frames that are drawn
     from the fit are as many, and evaluated in the same way, so that both distributions hold the same noise. Above:
     how many pixels have which dark current, and, shaded, the noise of one pixel's estimate; below: which share has
-    more. Large frames are shown in part.
+    more. Of large frames the middle is shown.
 
     Args:
         fit: result of `hsnoise.fit`, of darks of two exposures with two frames each.
@@ -191,7 +191,7 @@ def _ratio(axes: Axes, name: str, measured: np.ndarray, sampled: np.ndarray, edg
     axes.set_yscale("log")
     reach = float(np.clip(1.3 * np.exp(np.abs(np.log(ratio)).max(initial=0.0)), 2.0, MOST_RATIO))
     axes.set_ylim(1 / reach, reach)
-    ticks = [x for x in RATIOS if 1 / reach <= x <= reach]
+    ticks = [x for x in (RATIOS if reach < MOST_RATIO / 2 else RATIOS[::3]) if 1 / reach <= x <= reach]
     axes.set_yticks(ticks, [f"{x:g}" for x in ticks])
     axes.yaxis.set_minor_locator(NullLocator())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
@@ -37,7 +38,7 @@ def new_figure(width_in: float, height_in: float, title: str) -> Figure:
 def bend_axis(axes: Axes, near: float, low: float, high: float) -> None:
     """A horizontal axis that is linear within about `near` of 0 and logarithmic beyond, smoothly; plain numbers."""
     axes.set_xscale("asinh", linear_width=near)
-    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(max(-low, high, near))) + 1)
+    decades = 10.0 ** np.arange(np.floor(np.log10(near)) - 1, np.ceil(np.log10(max(-low, high, near))) + 1)
     apart, ticks = TICKS_APART * (np.arcsinh(high / near) - np.arcsinh(low / near)), [0.0]
     for x in (f * sign * d for f in (1, 5, 2) for sign in (1, -1) for d in decades[::-1]):
         if low <= x <= high and np.abs(np.arcsinh(np.array(ticks) / near) - np.arcsinh(x / near)).min() > apart:
@@ -47,13 +48,13 @@ def bend_axis(axes: Axes, near: float, low: float, high: float) -> None:
     axes.set_xlim(low, high)
 
 
-def plain_log(axes: Axes) -> None:
-    """A vertical logarithmic axis with plain numbers, more than one in a decade where it spans few."""
-    low, high = axes.get_ylim()
+def plain_log(axis: Axis) -> None:
+    """Plain numbers on a logarithmic axis, more than one in a decade where it spans few."""
+    low, high = axis.get_view_interval()
     short = np.log10(high / low) < SHORT_DECADES
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
-    axes.yaxis.set_major_formatter(lambda y, _: f"{y:,g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
+    axis.set_major_formatter(lambda value, _: f"{value:,g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def tidy(axes: Axes) -> None:
