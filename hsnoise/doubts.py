@@ -90,7 +90,7 @@ def checked(result: FitResult, found: Survey) -> FitResult:
     """The result with its doubts, and the notes of what it does not determine."""
     checks = (_withheld, _of_transfer, _of_pooling, _stated_gain, _black_level, _mosaic, _odd)
     grave = [sentence for check in checks for sentence in check(result, found)]
-    doubts = tuple(dict.fromkeys([*grave, *pixels_apart(found), *_outliers(result)]))
+    doubts = tuple(dict.fromkeys([*grave, *pixels_apart(found), *_outliers(result), *_moved_pedestals(result)]))
     notes = result.notes
     if result.method == "transfer":
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
@@ -125,7 +125,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
-    """Where pixels leave the line, pedestals move, and flats and darks disagree."""
+    """Where pixels leave the line, and flats and darks disagree."""
     pixel = result.transfer
     if pixel is None:
         return
@@ -139,14 +139,21 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
                 f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"
                 f" {t.dof:.0f} degrees of freedom): telegraph noise, a bent response, or charge that spreads."
             )
-        if t.moved.any():
+    if pixel.flats is not None:
+        yield from _flats_against_darks(pixel)
+
+
+def _moved_pedestals(result: FitResult) -> Iterator[str]:
+    """Pedestals that moved: the gain does not rest on them then."""
+    pixel = result.transfer
+    for channel in pixel.channels if pixel is not None and pixel.flats is None and not result.withheld else ():
+        t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
+        if t is not None and t.moved.any():
             e = int(np.argmax(t.moved))
             yield (
                 f"The pedestal{of} moved by {t.pedestal_dn[e]:+.2g} DN at {t.classes.exposure_s[e]:g} s, more than its"
                 " frames differ: the gain comes from the differences between pixels there."
             )
-    if pixel.flats is not None:
-        yield from _flats_against_darks(pixel)
 
 
 def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:

@@ -29,7 +29,7 @@ PATTERNS = {
     "row_x_frame": "row_noise",
     "column_x_frame": "column_noise",
 }
-DETERMINED = 0.35  # relative standard error up to which a gain is a number
+DETERMINED = 0.25  # relative standard error up to which a gain is a number
 MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that jump as if a signal grew
 ROW_GAIN_THERE = 3.0
 ROUNDS = 30
@@ -96,7 +96,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     narrow = _narrow(found, c)
     floor, floor_error = _temporal(found, c) if narrow is None else _of_narrow(narrow)
     pixels = pixels if narrow is None else None  # rounding, not light, sets the variance of narrow noise
-    transfer = None if pixels is None else pixel_transfer(classes_of(pixels, found.full_scale_dn))
+    transfer = None if pixels is None else _transfer(pixels, found, _row_gain(found, c, growth))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if transfer is not None and pixels is not None:
@@ -110,6 +110,17 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     rows, patterns = _row_gain(found, c, values[2]), _patterns(found, c)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor)
+
+
+def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
+    """Pixel transfer; what a gain of rows adds to pixels that are brighter than their row is taken off before."""
+    classes = classes_of(pixels, found.full_scale_dn)
+    variance, error = row_gain
+    if variance > ROW_GAIN_THERE * error:
+        ordinary = np.median(classes.level_dn[~classes.hot], axis=0) if (~classes.hot).any() else 0.0
+        streaks = variance * (classes.level_dn - ordinary) ** 2
+        classes = replace(classes, variance_dn2=np.maximum(classes.variance_dn2 - streaks, 1e-3))
+    return pixel_transfer(classes)
 
 
 def _offset(found: Survey, c: int) -> tuple[float, float]:

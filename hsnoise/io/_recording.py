@@ -17,7 +17,7 @@ from hsnoise._types import StatedGain
 UNKNOWN_ORDER = "unknown order"  # a colour mosaic whose Bayer order the file does not tell for sure
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """Frames of one exposure in one file; what the file does not say is None.
 

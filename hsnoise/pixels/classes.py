@@ -121,7 +121,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     else:
         # Differences do not know of the mean of the same frames; ordinary pixels are one class.
         mean = growth.mean(0)
-        peak = np.sqrt(pixels.whole_variance * (pixels.n_frames[:, None] - 1))
+        peak = np.sqrt(np.maximum(pixels.whole_variance, 0) * (pixels.n_frames[:, None] - 1))
         members = _members(mean, _edges(mean, limit, False))
         level = pixels.level.mean(1)
         parts = [_measured(members, level, pixels.whole_variance, peak, level, t, pixels.n_frames - 1, full_scale_dn)]

@@ -57,32 +57,41 @@ def halves_of(counts: np.ndarray) -> Halves:
     n = len(counts)
     lowest, highest = counts.min(0).ravel(), counts.max(0).ravel()
     values = counts.astype(np.float32)
-    frame_means = _take_off_common(values)
+    frame_means, added = _take_off_common(values)
     flat = values.reshape(n, -1)
-    lost = _share_left(values.shape)
-    parts = [_moments(flat[half::2], lost) for half in (0, 1)]
+    parts = [_moments(flat[half::2], added) for half in (0, 1)]
     level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
-    whole = flat.var(0, ddof=1) / lost
+    whole = flat.var(0, ddof=1) - added
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
     frames = len(flat[::2]), len(flat[1::2])
     return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise)
 
 
-def _take_off_common(values: np.ndarray) -> np.ndarray:
-    """Take the offsets of frames, of rows and of columns in a frame off `values` in place; returns those of frames."""
+def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
+    """Take the offsets of frames, of rows and of columns in a frame off `values` in place.
+
+    Those of a pixel come from the other pixels of its row and column, so that no part of its own noise goes with them,
+    however noisy it is. Returns the offsets of the frames, and the variance that the offsets' own noise adds to each
+    pixel, DN^2.
+    """
+    n, h, w = values.shape
     mean = values.mean(0)
     spread = _core_spread(values[0] - mean) + np.float32(1e-3)
-    offsets = np.empty(len(values))
+    offsets, power = np.empty(n), 0.0
     for k, frame in enumerate(values):
         rest = np.clip(frame - mean, -CORE_SIGMAS * spread * 4, CORE_SIGMAS * spread * 4)
         offsets[k] = _clipped_mean(rest, spread)
         rest = np.clip(rest - np.float32(offsets[k]), -CORE_SIGMAS * spread, CORE_SIGMAS * spread)
-        of_rows = rest.mean(1, keepdims=True)
-        frame -= np.float32(offsets[k]) + of_rows
-        if len(frame) >= FEWEST_ROWS:
-            frame -= (rest - of_rows).mean(0, keepdims=True)
+        frame -= np.float32(offsets[k])
+        if w > 1:
+            frame -= (rest.sum(1, keepdims=True) - rest) / np.float32(w - 1)
+        rest -= rest.mean(1, keepdims=True)
+        if h >= FEWEST_ROWS:
+            frame -= (rest.sum(0, keepdims=True) - rest) / np.float32(h - 1)
+        power += float(np.mean(rest**2))
     values += np.float32(_typical(offsets))
-    return offsets - _typical(offsets)
+    share = (1 / (w - 1) if w > 1 else 0.0) + (1 / (h - 1) if h >= FEWEST_ROWS else 0.0)
+    return offsets - _typical(offsets), np.float32(power / (n - 1) * share)
 
 
 def _typical(offsets: np.ndarray) -> float:
@@ -105,16 +114,10 @@ def _core_spread(rest: np.ndarray) -> np.float32:
     return np.float32((high - low) / 2)
 
 
-def _share_left(shape: tuple[int, ...]) -> np.float32:
-    """Of the temporal variance, what is left when the means of rows and columns of a frame have been taken off."""
-    _, rows, columns = shape
-    return np.float32((1 - 1 / columns) * (1 - 1 / rows if rows >= FEWEST_ROWS else 1.0))
-
-
-def _moments(flat: np.ndarray, lost: np.float32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _moments(flat: np.ndarray, added: np.float32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     level = flat.mean(0)
     off = flat - level
     peak = np.abs(off).max(0)
     if len(flat) < 2:
         return level, np.full_like(level, np.nan), peak
-    return level, np.einsum("fp,fp->p", off, off) / np.float32(len(flat) - 1) / lost, peak
+    return level, np.einsum("fp,fp->p", off, off) / np.float32(len(flat) - 1) - added, peak

@@ -14,7 +14,7 @@ SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
 SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
-STREAKS = 0.04  # variance of row means over that of pixels from which streaks rule the noise
+STREAKS = 0.2  # variance of row means over that of pixels from which streaks rule the noise
 CLIPPED = 0.3  # share of clipped counts from which the moments of pixels over time say too little of the noise
 
 
