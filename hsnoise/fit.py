@@ -106,7 +106,8 @@ def fit(
     differ = measurable and _is_conditional(found, method, pixels)
     simulated = tuple(name for name in extra if not (differ and name in POPULATION))
     if simulated:
-        return _with_effects(source, model, simulated, method, pixels, progress)
+        result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
+        return result if found is None else checked(result, found)
     if model is not None:
         _check_complete(model)
     summary = source if isinstance(source, Summary) else _summary_of(source, progress)
@@ -185,7 +186,7 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
 
 def _surveyed(stack) -> Survey:
     """A survey of the stack, or where it is large of a part: enough to tell whether pixels differ."""
-    stack.check()
+    _check_size(stack)
     rows, columns = stack.shape
     frames = slice(0, PROBE_FRAMES)
     if rows * columns <= PROBE_PIXELS:
@@ -208,13 +209,18 @@ def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
     return method != "line" and pixels == "auto" and pixels_differ(found) and can_be_transferred(found)
 
 
-def _summary_of(stack, progress) -> Summary:
+def _check_size(stack) -> None:
+    """Raise ValueError for frames that cannot be fitted, before any long work."""
     stack.check()
     rows, columns = stack.shape
     if min(rows, columns) < SMALLEST:
         raise ValueError(
             f"counts: a fit needs frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}"
         )
+
+
+def _summary_of(stack, progress) -> Summary:
+    _check_size(stack)
     if stack.cfa == "mono":
         warn_of_a_mosaic(stack.frame(int(np.argmax(stack.exposure_s)), 0))
     summary = summarise(stack, progress)
