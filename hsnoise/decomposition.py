@@ -24,11 +24,15 @@ BLOCK_ROWS = 256  # rows that are float64 at a time
 
 @dataclass(frozen=True)
 class Component:
-    """Variance of one component and its standard error, DN^2 (NaN: these frames do not tell), and its share."""
+    """Variance of one component and its standard error, DN^2 (NaN: these frames do not tell), and its share.
+
+    chance_dn2: standard deviation of the estimate where there is no such component.
+    """
 
     variance_dn2: float
     standard_error_dn2: float
     share: float = float("nan")
+    chance_dn2: float = float("nan")
 
 
 class PlaneSums:
@@ -130,5 +134,8 @@ def _from_mean_squares(squares: dict[str, float], n: int, h: int, w: int) -> dic
         span, signs = contrasts[name]
         variance = sum(sign * mean[other] for other, sign in signs.items()) / span
         error = np.sqrt(sum(2 * mean[other] ** 2 / dof[other] for other in signs)) / span
-        found[name] = Component(float(variance), float(error))
+        without = mean[name] - span * variance  # what its mean square expects if there is none
+        rest = sum(2 * mean[other] ** 2 / dof[other] for other in signs if other != name)
+        chance = np.sqrt(2 * without**2 / dof[name] + rest) / span
+        found[name] = Component(float(variance), float(error), chance_dn2=float(chance))
     return found

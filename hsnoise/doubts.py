@@ -17,7 +17,7 @@ from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
 from hsnoise.pixels.oddities import oddities_of, pixels_apart
-from hsnoise.pixels.structure import can_be_transferred, has_patterns, static_of
+from hsnoise.pixels.structure import can_be_transferred, full_of_hits, has_patterns, noise_spread, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
@@ -27,7 +27,9 @@ APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two 
 HEADER_SHARE = 0.08  # of a gain that a header states
 BLACK_SIGMAS, BLACK_DN = 5.0, 0.25
 OFF_LINE = 3.0  # chi2 per degree of freedom
-MANY_OUTLIERS = 3e-3  # share of pixels
+MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
+CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
+MANY_HOT = 0.15  # share of pixels
 STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
 
 
@@ -47,7 +49,7 @@ def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
 
 def confirmed(result: FitResult, found: Survey, summary: Summary, model) -> FitResult:
     """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
-    if summary.flats is not None or not can_be_transferred(found) or not _several(found):
+    if summary.flats is not None or not can_be_transferred(found) or not _several(found) or full_of_hits(found):
         return result
     pixel = measure(found, summary)
     if not pixel.determined:
@@ -88,18 +90,31 @@ def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResu
 
 def checked(result: FitResult, found: Survey) -> FitResult:
     """The result with its doubts, and the notes of what it does not determine."""
-    checks = (_withheld, _of_transfer, _of_pooling, _stated_gain, _black_level, _mosaic, _odd)
+    checks = (
+        _withheld,
+        _single_frames,
+        _of_transfer,
+        _clipped,
+        _falling,
+        _of_pooling,
+        _stated_gain,
+        _black_level,
+        _mosaic,
+        _odd,
+    )
     grave = [sentence for check in checks for sentence in check(result, found)]
-    doubts = tuple(dict.fromkeys([*grave, *pixels_apart(found), *_outliers(result), *_moved_pedestals(result)]))
+    share = _outlier_share(result)
+    minor = (*pixels_apart(found), *_outliers(result), *_moved_pedestals(result), *_many_hot(result))
+    doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
     if result.method == "transfer":
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
-    return replace(result, doubts=doubts, grave=bool(grave), notes=notes)
+    return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
 
 
 def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     """Which parameters are withheld, what is known instead, and which capture would determine them."""
-    if not result.withheld:
+    if not any(name.startswith("gain") for name in result.withheld):
         return
     pixel: PixelFit = result.transfer
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
@@ -119,9 +134,16 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     else:
         why = "the dark signal of ordinary pixels does not grow with exposure by enough"
     yield (
-        f"The gain is not determined: {why}. Read noise is {read_dn:.4g} ± {error / max(2 * read_dn, 1e-9):.2g} DN. Add"
+        f"The gain is not determined: {why}. {_named_noise(found)} is {read_dn:.4g} ±"
+        f" {error / max(2 * read_dn, 1e-9):.2g} DN. Add"
         " flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
     )
+
+
+def _named_noise(found: Survey) -> str:
+    """What the noise without signal is: with one exposure, that exposure's own, dark shot noise included."""
+    shortest = min(g.exposure_s for g in found.darks if g.n_frames > 1)
+    return "Read noise" if _several(found) or shortest == 0 else f"The noise at {shortest:g} s, shot noise included,"
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
@@ -167,6 +189,63 @@ def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
                 f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
                 " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
             )
+
+
+def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
+    """Darks of which no exposure has two frames: nothing tells whether pixels differ."""
+    if found.darks and all(g.n_frames < 2 for g in found.darks):
+        yield (
+            "Each exposure has one dark frame, so that differences between pixels cannot be told from noise; with"
+            " them, gain and read noise are wrong by large factors. Take two frames of each exposure, better eight."
+        )
+
+
+def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
+    """Clipping of pixels whose noise differs: its correction takes the noise of a class for one."""
+    if result.transfer is None or result.withheld:
+        return
+    for c, _ in enumerate(found.channels):
+        clipped = max((g.clipped_share[c] for g in found.darks if g.n_frames > 1), default=0.0)
+        if clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
+            yield (
+                f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: what clipping takes"
+                " off is not known well, and gain and read noise may be off by several percent. Raise the black level."
+            )
+            return
+
+
+def _falling(result: FitResult, found: Survey) -> Iterator[str]:
+    """A level that falls with exposure by more than the noise of a pixel: swapped exposures, or a subtracted dark."""
+    darks = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    for one, other in zip(darks, darks[1:], strict=False):
+        if other.exposure_s == one.exposure_s:
+            continue
+        fall = np.mean(
+            [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
+        )
+        noise = np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes]))
+        if fall > noise:
+            yield (
+                f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than the"
+                " noise of a pixel: exposures are swapped, or the camera subtracts its dark signal."
+            )
+            return
+
+
+def _outlier_share(result: FitResult) -> float:
+    """Largest share of pixels that were set apart for an outlier."""
+    channels = result.transfer.channels if result.transfer is not None else ()
+    return max((float(c.transfer.classes.outlier_share.max()) for c in channels if c.transfer is not None), default=0.0)
+
+
+def _many_hot(result: FitResult) -> Iterator[str]:
+    """A population that the effects of the model do not describe."""
+    share = result.table.get("hot_pixels.fraction", (0.0,))[0]
+    if share > MANY_HOT:
+        yield (
+            f"{100 * share:.2g} % of the pixels came out as hot: dark currents are not log-normal with a few hot pixels"
+            " above. Their mean over all pixels is right, their distribution in the model is rough."
+        )
 
 
 def _outliers(result: FitResult) -> Iterator[str]:

@@ -114,9 +114,10 @@ def fit(
     if differ or measurable and pixels == "auto" and carries_no_gain(found, summary, method):
         return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), found)
     result = _pooled(summary, model, method)
-    if found is None or method == "line":
+    if found is None:
         return result
-    return checked(confirmed(replace(result, stack=source), found, summary, model), found)
+    result = replace(result, stack=source)
+    return checked(confirmed(result, found, summary, model) if pixels == "auto" and method != "line" else result, found)
 
 
 def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:

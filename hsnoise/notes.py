@@ -69,7 +69,8 @@ def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | 
         return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
     if parameter == "row_gain.white_share" and name in result.names and error > 0.1:
         return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
-    if parameter == "black_level" and name in result.names and error > 1.0:
+    has_bias = len(result.summary.exposure_s) > 0 and result.summary.exposure_s.min() == 0
+    if parameter == "black_level" and name in result.names and error > 1.0 and not has_bias:
         known = "" if np.isinf(error) else f" ({error:.2g} DN)"
         return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."
     return None

@@ -17,8 +17,9 @@ from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.pixels.population import Population, offset_sigma, population_of
+from hsnoise.pixels.shading import Shading, shading_of
 from hsnoise.pixels.structure import double_differences, low_side_sigma, plane_rows
-from hsnoise.pixels.survey import Survey
+from hsnoise.pixels.survey import Plane, Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 from hsnoise.statistics import Summary
 
@@ -47,8 +48,10 @@ class Channel:
             known has an error of UNKNOWN.
         black_dn: level without signal and its error.
         row_gain: variance of the gain of rows and its error.
-        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its error.
+        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its standard
+            error, and its deviation by chance where there is none.
         temporal_dn2: variance of the pixels themselves.
+        shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
     """
 
     name: str
@@ -59,8 +62,9 @@ class Channel:
     covariance: np.ndarray
     black_dn: tuple[float, float]
     row_gain: tuple[float, float]
-    patterns: Mapping[str, tuple[float, float]]
+    patterns: Mapping[str, tuple[float, float, float]]
     temporal_dn2: float
+    shading: Mapping[str, Shading]
 
 
 @dataclass(frozen=True)
@@ -107,9 +111,10 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             # Where ordinary pixels do not grow, hot ones give a bound only.
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
-    rows, patterns = _row_gain(found, c, values[2]), _patterns(found, c)
+    rows, shading = _row_gain(found, c, values[2]), _shadings(found, c)
+    patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
-    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor, shading)
 
 
 def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
@@ -141,17 +146,36 @@ def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
     return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
 
 
-def _patterns(found: Survey, c: int) -> dict[str, tuple[float, float]]:
-    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+def _shortest(found: Survey, c: int) -> list[Plane]:
+    """The planes of a channel at the shortest dark exposure of several frames; empty without one."""
     groups = [g for g in found.darks if g.n_frames > 1]
-    if not groups:
-        return {}
-    planes = [p for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == c]
-    out = {}
+    return [p for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == c] if groups else []
+
+
+def _shadings(found: Survey, c: int) -> dict[str, Shading]:
+    """Drifts of the black level along the rows and down the frame."""
+    planes, out = _shortest(found, c), {}
+    for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
+        if planes:
+            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
+            one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
+            out |= {} if one is None else {axis: one}
+    return out
+
+
+def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
+    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    planes, out = _shortest(found, c), {}
+    if not planes:
+        return out
     for component, effect in PATTERNS.items():
         parts = [p.components[component] for p in planes]
-        error = np.sqrt(sum(one.standard_error_dn2**2 for one in parts)) / len(parts)
-        out[effect] = float(np.mean([one.variance_dn2 for one in parts])), float(error)
+        error, chance = (
+            float(np.sqrt(sum(getattr(one, name) ** 2 for one in parts))) / len(parts)
+            for name in ("standard_error_dn2", "chance_dn2")
+        )
+        smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
+        out[effect] = float(np.mean([one.variance_dn2 for one in parts])) - smooth, error, chance
     return out
 
 
@@ -190,8 +214,12 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     """Growth of the median pixel with exposure, DN/s, and level without signal, DN, each with its standard error."""
     darks = found.darks
     t = np.array([g.exposure_s for g in darks])
-    level = np.array([np.mean([np.median(p.row_mean_dn) for p in g.planes if p.channel == c]) for g in darks])
-    frames = [np.mean([p.frame_means_dn for p in g.planes if p.channel == c], axis=0) for g in darks]
+    planes = [[p for p in g.planes if p.channel == c] for g in darks]
+    level = np.array([np.mean([_level(p) for p in of]) for of in planes])
+    frames = [
+        np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
+        for of in planes
+    ]
     scatter = np.sqrt(np.mean([of.var(ddof=1) for of in frames if len(of) > 1] or [1.0]))
     error = np.array([max(scatter, 1e-6) / np.sqrt(len(of)) for of in frames])
     if np.ptp(t) == 0:
@@ -204,6 +232,11 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
     errors = np.sqrt(np.diagonal(covariance))
     return (float(theta[1]), float(errors[1])), (float(theta[0]), float(errors[0]))
+
+
+def _level(plane: Plane) -> float:
+    """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
+    return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 
 
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:

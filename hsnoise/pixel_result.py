@@ -14,6 +14,7 @@ from hsnoise.effects import (
     ADC,
     AbstractEffect,
     BlackLevel,
+    BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
     DarkCurrent,
@@ -31,13 +32,16 @@ from hsnoise.effects import (
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics
 from hsnoise.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
+from hsnoise.pixels.shading import Shading
 from hsnoise.pixels.transfer import ROUNDING
 from hsnoise.result import FitResult
 from hsnoise.statistics import Summary
 
+NOMINAL = 50.0  # relative deviation of a gain of which nothing is known
 FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
 THERE = 5.0  # standard errors from which an effect of the population is in the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not tell it
+IN_OTHER_UNITS = {"dark_current_nonuniformity", "black_shading"}
 IN_ELECTRONS = ("gain", "dark_current.rate", "read_noise.sigma")
 OF_PIXELS = (
     DarkCurrentNonuniformity,
@@ -48,9 +52,10 @@ OF_PIXELS = (
     ColumnFixedPattern,
     RowNoise,
     ColumnNoise,
+    BlackShading,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
-PATTERN_THERE, LEAST_PATTERN = 4.0, 1e-3  # standard errors, share of the temporal variance
+PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # deviations by chance, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
 
@@ -70,9 +75,14 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
             exponent=jnp.asarray(ROLLING_EXPONENT if summary.shutter == "rolling" else 0.0),
             black_level=jnp.asarray(black[0]),
         )
-        params = _model(wanted, physics, population, summary, model)
+        params = _model(wanted, physics, population, summary, pixel)
     names, covariance = _covariance(pixel, params, population, black[1], row)
     withheld = () if pixel.determined else tuple(n for n in params.table() if _in_electrons(n))
+    errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
+    unknown = [name for name, error in errors.items() if name.startswith("row_gain.sigma") and error > 1]
+    if np.ptp(summary.exposure_s) == 0 and "dark_current" in params:
+        unknown.append("dark_current.rate")
+    withheld = tuple(dict.fromkeys((*withheld, *unknown)))
     return FitResult(
         params=params,
         physics=jax.tree.map(np.asarray, physics),
@@ -94,7 +104,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
 def _in_electrons(name: str) -> bool:
     """Whether a parameter has no value without the gain."""
     effect = name.split(".")[0]
-    return name.startswith(IN_ELECTRONS) or effect in POPULATION and effect != "dark_current_nonuniformity"
+    return name.startswith(IN_ELECTRONS) or effect in set(POPULATION) - IN_OTHER_UNITS
 
 
 def _outcome(pixel: PixelFit) -> str:
@@ -119,13 +129,19 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
 def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
     """Effects of the population that are there: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
+    drift = _shading(pixel)
+    if drift is not None:
+        _, one = drift
+        found["black_shading"] = {"amplitude": (one.amplitude_dn, one.error_dn), "length": (one.length, 0.0)}
     for name in PATTERNS.values():
-        parts = [
-            (*c.patterns.get(name, (0.0, 0.0)), g, c.temporal_dn2) for c, g in zip(pixel.channels, gain, strict=True)
+        many_of = [
+            (c.patterns.get(name, (0.0, 0.0, 0.0)), g, c.temporal_dn2)
+            for c, g in zip(pixel.channels, gain, strict=True)
         ]
-        variance, error = _mean([(v / g**2, e / g**2) for v, e, g, _ in parts])
-        noise = float(np.mean([t / g**2 for _, _, g, t in parts]))
-        if variance > max(PATTERN_THERE * error, LEAST_PATTERN * noise):
+        variance, error = _mean([(of[0] / g**2, of[1] / g**2) for of, g, _ in many_of])
+        _, chance = _mean([(0.0, of[2] / g**2) for of, g, _ in many_of])
+        noise = float(np.mean([t / g**2 for _, g, t in many_of]))
+        if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
@@ -144,11 +160,17 @@ def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[
     fano = _fano(pixel)
     if fano is not None:
         hot["fano"] = fano
-    if spread[0] > 0:
+    if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
     if hot["fraction"][0] > THERE * hot["fraction"][1] and hot["rate"][0] > 0:
         found["hot_pixels"] = hot
     return found
+
+
+def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
+    """Axis and size of the strongest drift of the black level, of the first colour that has one."""
+    many = [(axis, one) for c in pixel.channels[:1] for axis, one in c.shading.items()]
+    return max(many, key=lambda pair: pair[1].amplitude_dn) if many else None
 
 
 def _fano(pixel: PixelFit) -> tuple[float, float] | None:
@@ -201,7 +223,7 @@ def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
     return np.array(sigma), np.array(error)
 
 
-def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Summary, model) -> NoiseModel:
+def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Summary, pixel: PixelFit) -> NoiseModel:
     made = {
         "shot_noise": ShotNoise,
         "dark_current": lambda: DarkCurrent(physics.dark_current),
@@ -217,10 +239,25 @@ def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Su
         if name in classes:
             fields = {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
-            fields = fields or dict.fromkeys(required, 0.0)
-            effects.append(classes[name](**fields))
+            fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}
+            drift = _shading(pixel) if name == "black_shading" else None
+            chosen = {} if drift is None else {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
+            effects.append(classes[name](**fields, **chosen))
     t = np.sort(summary.exposure_s)
     return NoiseModel(effects, cfa=summary.cfa, shutter=summary.shutter, exposure_s=float(t[len(t) // 2]))
+
+
+def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:
+    """Covariance of gain, read noise and dark current where only their products, in DN, are known."""
+    n = len(pixel.channels)
+    read, rate = (
+        float(params["read_noise"].sigma),
+        float(params["dark_current"].rate) if "dark_current" in params else 0.0,
+    )
+    along = np.append(np.ones(n), [-read, -rate])
+    floor, growth = (float(np.mean([c.covariance[i, i] for c in pixel.channels])) / n for i in (1, 2))
+    known = np.append(np.full(n, 1e-6), [np.sqrt(floor) / max(2 * read, 1e-6), min(np.sqrt(growth), UNKNOWN)])
+    return NOMINAL**2 * np.outer(along, along) + np.diag(known**2)
 
 
 def _covariance(
@@ -241,8 +278,6 @@ def _covariance(
     covariance = np.diag([errors.get(n, 0.0) ** 2 for n in names])
     places = [names.index(n) for n in joint if n in names]
     kept = [i for i, n in enumerate(joint) if n in names]
-    whole = (
-        pixel.covariance if pixel.determined else np.full(pixel.covariance.shape, 0.0) + np.eye(len(joint)) * UNKNOWN**2
-    )
+    whole = pixel.covariance if pixel.determined else _without_gain(pixel, params)
     covariance[np.ix_(places, places)] = whole[np.ix_(kept, kept)]
     return tuple(names), covariance

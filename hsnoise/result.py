@@ -24,7 +24,7 @@ from hsnoise.statistics import Summary, without_counts
 TITLES = {
     "ml": "Joint maximum likelihood",
     "line": "Line fit",
-    "transfer": "Pixel transfer: each pixel over time, its own level no noise",
+    "transfer": "Pixel transfer",
     "synthetic": "Base fit, corrected for added effects by simulated statistics",
 }
 
@@ -73,7 +73,7 @@ class FitResult:
     @property
     def trustworthy(self) -> bool:
         """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
-        return self.converged and not self.grave and not self.withheld
+        return self.converged and not self.grave
 
     @cached_property
     def pixels(self) -> PixelMaps:

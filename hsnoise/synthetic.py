@@ -17,7 +17,7 @@ import numpy as np
 
 from hsnoise._threads import in_threads
 from hsnoise._types import unit_in_words
-from hsnoise.coordinates import Coordinates, coordinates_for
+from hsnoise.coordinates import Coordinates, coordinates_for, labels
 from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_variance, part_of, share_of_far
 from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at
@@ -81,13 +81,24 @@ class Problem:
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
         """Variances and directions of the covariance of the base coordinates over their sizes."""
         slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12) * self.sizes
-        covariance, unknown = self.base.covariance.copy(), ~np.isfinite(np.diagonal(self.base.covariance))
+        covariance = self._base_covariance()
+        unknown = ~np.isfinite(np.diagonal(covariance))
         covariance[unknown], covariance[:, unknown] = 0.0, 0.0
         covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
         covariance = covariance / slope[:, None] / slope[None, :]
         # Beside a deviation of millions, one of thousandths would have no digits.
         share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
         return np.linalg.eigh(covariance * share[:, None] * share[None, :])
+
+    def _base_covariance(self) -> np.ndarray:
+        """Covariance of the base fit in the order of the coordinates; infinite variance of what it did not fit."""
+        names = labels(self.coordinates, self.base.params.channels)
+        known = {name: i for i, name in enumerate(self.base.names)}
+        covariance = np.diag(np.full(len(names), np.inf))
+        here = [i for i, name in enumerate(names) if name in known]
+        there = [known[names[i]] for i in here]
+        covariance[np.ix_(here, here)] = self.base.covariance[np.ix_(there, there)]
+        return covariance
 
     @cached_property
     def whiten(self) -> np.ndarray:

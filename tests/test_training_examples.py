@@ -110,6 +110,8 @@ def test_jitter_changes_what_may_not_be_negative_by_a_tenth():
         ratio = np.array([table[name][0] for table in drawn]) / max(value, 1e-12)
         if name.startswith("black_level") or name == "row_gain.exponent":
             assert np.all(ratio == 1), name
+        elif value == 0:
+            assert np.all(ratio == 0), name
         else:
             assert 0.06 < np.log(ratio).std() < 0.15, name
 

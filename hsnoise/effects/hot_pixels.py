@@ -7,9 +7,10 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from hsnoise._keys import named_key
 from hsnoise._types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+
+PAIRS = 1  # what sets the random key of electrons that come in pairs apart
 
 
 class HotPixels(AbstractEffect):
@@ -48,7 +49,7 @@ class HotPixels(AbstractEffect):
         mean = jnp.where(hot, strength * (self.rate * capture.exposure_s + self.at_readout), 0)
         in_pairs = 2 * (1 - self.fano)
         single = draw_poisson(key, (1 - in_pairs) * mean, signal.shape)
-        steps, phase = jax.random.split(named_key(key, "pairs"))
+        steps, phase = jax.random.split(jax.random.fold_in(key, PAIRS))
 
         def second_steps():
             begun = jax.random.bernoulli(phase, 0.5, signal.shape)

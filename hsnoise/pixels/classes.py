@@ -121,7 +121,9 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     else:
         # Differences do not know of the mean of the same frames; ordinary pixels are one class.
         mean = growth.mean(0)
+        few = pixels.n_frames[:, None] < 4  # a deviation is at most all of the variance
         peak = np.sqrt(np.maximum(pixels.whole_variance, 0) * (pixels.n_frames[:, None] - 1))
+        peak = np.where(few, peak, pixels.peak.max(1))
         members = _members(mean, _edges(mean, limit, False))
         level = pixels.level.mean(1)
         parts = [_measured(members, level, pixels.whole_variance, peak, level, t, pixels.n_frames - 1, full_scale_dn)]

@@ -10,7 +10,7 @@ from hsnoise.pixels.survey import Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
 DIM = 0.5  # of the median response to light: below it a pixel is dead
-RARE = 1e-5  # chance of a variance so high, in each half of the frames
+RARE = 1e-3  # chance of a variance so high, in each half of the frames
 
 
 def flags_of(found: Survey, channel: int) -> np.ndarray:
@@ -75,4 +75,6 @@ def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:
         inside = variance[number == i]
         typical[i] = np.minimum(inside, np.quantile(inside, 0.9)).mean() if inside.size > 20 else np.nan
     known = np.flatnonzero(np.isfinite(typical))
+    if not known.size:
+        return np.full(len(level), np.median(variance))
     return np.interp(np.arange(len(edges)), known, typical[known])[number]

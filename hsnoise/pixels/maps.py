@@ -103,7 +103,7 @@ def _band(found: Survey) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
         growth = slope_over(t, level) if np.ptp(t) > 0 else np.full(level.shape[1:], np.nan)
         offset[at] = (level.mean(0) - np.nan_to_num(growth) * t.mean()).reshape(size)
         rate[at] = growth.reshape(size)
-        noise[at] = np.sqrt(darks[shortest].planes[p].halves.pair_variance_dn2).reshape(size)
+        noise[at] = np.sqrt(np.maximum(darks[shortest].planes[p].halves.pair_variance_dn2, 0)).reshape(size)
         pixels, c = size[0] * size[1], plane.channel
         flags[at] = of_channel[c][used[c] : used[c] + pixels].reshape(size)
         used[c] += pixels

@@ -34,7 +34,8 @@ def _frames(found: Survey) -> Iterator[str]:
         off = level - np.median(level)
         scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
         pixel = float(np.median(noise))
-        for f in np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
+        lit = group.kind == "flat"  # flicker is taken off flats
+        for f in () if lit else np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
             side = "brighter" if off[f] > 0 else "darker"
             yield (
                 f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or of"
@@ -50,6 +51,8 @@ def _frames(found: Survey) -> Iterator[str]:
 def _lines(found: Survey) -> Iterator[str]:
     for group in found.groups[:1]:
         odd = group.odd_lines
+        if any(p.narrow_dn is not None for p in group.planes):
+            return  # lines of one count are no wonder
         for what, lines in (("rows", odd.constant_rows), ("columns", odd.constant_columns)):
             if len(lines):
                 yield f"{_listed(what, lines)} have one count throughout: they are dead, or padding. Crop them (roi)."
@@ -89,4 +92,4 @@ def pixels_apart(found: Survey) -> Iterator[str]:
                 " (telegraph-like)."
             )
         if shares["dead"] > MANY["stuck"]:
-            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly answer to light: they are dead."
+            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly answer to light: they are dead, or overscan."

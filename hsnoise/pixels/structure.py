@@ -12,10 +12,11 @@ from hsnoise.pixels.survey import Group, Survey
 WINSOR_SIGMAS = 5.0
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+HITS = 10.0  # temporal variance of all pixels over that of the typical one
 SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
-STREAKS = 0.2  # variance of row means over that of pixels from which streaks rule the noise
-CLIPPED = 0.3  # share of clipped counts from which the moments of pixels over time say too little of the noise
+STREAKS = 0.05  # growth of the variance of row means over that of pixels from which streaks rule the noise
+CLIPPED = 0.6  # share of clipped counts from which the moments of pixels over time say too little of the noise
 
 
 class Static(NamedTuple):
@@ -92,6 +93,27 @@ def pixels_differ(found: Survey) -> bool:
     return False
 
 
+def full_of_hits(found: Survey) -> bool:
+    """Whether what changes is mostly hits in a few pixels: a likelihood with a share of outliers does better then."""
+    planes = [p for g in found.darks if g.n_frames > 1 for p in g.planes]
+    typical = [float(np.median(p.halves.pair_variance_dn2)) for p in planes]
+    changing = [p.components["temporal"].variance_dn2 for p in planes]
+    return any(all_of > HITS * max(of, 1e-6) for all_of, of in zip(changing, typical, strict=True))
+
+
+def noise_spread(found: Survey, channel: int) -> float:
+    """Relative standard deviation over pixels of the temporal variance at the shortest exposure, by two halves."""
+    groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
+    if not groups:
+        return 0.0
+    halves = [p.halves for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == channel]
+    a, b = np.concatenate([h.variance_dn2 for h in halves], 1).astype(np.float64)
+    top = np.quantile(np.concatenate([a, b]), 0.999)
+    a, b = np.minimum(a, top), np.minimum(b, top)
+    covariance = float(((a - a.mean()) * (b - b.mean())).mean())
+    return float(np.sqrt(max(covariance, 0.0)) / max(a.mean(), 1e-12))
+
+
 def has_patterns(found: Survey) -> bool:
     """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
     groups = [g for g in found.darks if g.n_frames > 1]
@@ -99,7 +121,7 @@ def has_patterns(found: Survey) -> bool:
         noise = plane.components["temporal"].variance_dn2
         for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
             one = plane.components[name]
-            if one.variance_dn2 > max(SIGNIFICANT * one.standard_error_dn2, SMALL_PATTERN * noise):
+            if one.variance_dn2 > max(SIGNIFICANT * one.chance_dn2, SMALL_PATTERN * noise):
                 return True
     return False
 
@@ -118,13 +140,11 @@ def _always_bright(found: Survey, channel: int) -> float:
 
 def can_be_transferred(found: Survey) -> bool:
     """Whether pixels over time show their noise: hardly clipped, and not ruled by streaks of rows."""
-    for group in found.darks:
-        if group.n_frames < 2:
-            continue
-        if group.clipped_share.max() > CLIPPED:
-            return False
-        for plane in group.planes:
-            streaks, noise = (plane.components[name].variance_dn2 for name in ("row_x_frame", "temporal"))
-            if streaks > STREAKS * noise:
-                return False
-    return True
+    groups = [g for g in found.darks if g.n_frames > 1]
+    if not groups or max(g.clipped_share.max() for g in groups) > CLIPPED:
+        return False
+    # Offsets of rows are taken off; a gain of rows grows with the signal, and changes the noise within them.
+    streaks = [[p.components["row_x_frame"].variance_dn2 for p in g.planes] for g in groups]
+    noise = [[p.components["temporal"].variance_dn2 for p in g.planes] for g in groups]
+    grown = np.array(streaks) - np.min(streaks, axis=0)
+    return bool((grown <= STREAKS * np.array(noise)).all())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -178,9 +178,9 @@ def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple
     scatter = {"temporal": halves.pair_variance_dn2, "pixel": level**2}
     for name, values in scatter.items():
         error = float(values.std(dtype=np.float64)) / np.sqrt(shape[0] * shape[1])
-        found[name] = Component(found[name].variance_dn2, max(error, found[name].standard_error_dn2))
+        found[name] = replace(found[name], standard_error_dn2=max(error, found[name].standard_error_dn2))
     total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
     return {
-        name: Component(c.variance_dn2, c.standard_error_dn2, max(c.variance_dn2, 0.0) / total if total > 0 else np.nan)
+        name: replace(c, share=max(c.variance_dn2, 0.0) / total if total > 0 else float("nan"))
         for name, c in found.items()
     }

@@ -1,0 +1,46 @@
+"""A black level that drifts along a line or a frame: the smooth part of the static means of columns or rows."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+LENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # in widths of the frame; the last is a straight line
+LEAST_SHARE = 0.3  # of the variance of the means that a shading must explain
+THERE = 5.0  # standard errors
+
+
+class Shading(NamedTuple):
+    """Exponential drift of the means of lines: rms and its error, DN, length in frames, where steepest, its sign."""
+
+    amplitude_dn: float
+    error_dn: float
+    length: float
+    start: str
+    above: bool
+
+
+def shading_of(means_dn: np.ndarray, noise_dn: float) -> Shading | None:
+    """The shading of the static means of lines [line], DN; None if it explains too little of them.
+
+    noise_dn: standard error of each mean.
+    """
+    y = means_dn - means_dn.mean()
+    distance = np.arange(len(y)) / max(len(y) - 1, 1)
+    best = None
+    for start in ("first", "last"):
+        for length in LENGTHS:
+            shape = np.exp(-(distance if start == "first" else distance[::-1]) / length)
+            shape = shape - shape.mean()
+            shape /= np.sqrt((shape**2).mean())
+            size = float((shape * y).mean())
+            if best is None or abs(size) > abs(best[0]):
+                best = size, length, start
+    assert best is not None
+    size, length, start = best
+    left = max(float((y**2).mean()) - size**2, 0.0)
+    error = float(np.sqrt((left + noise_dn**2) / len(y)))
+    if abs(size) < THERE * error or size**2 < LEAST_SHARE * float((y**2).mean()):
+        return None
+    return Shading(abs(size), error, length, start, size > 0)
