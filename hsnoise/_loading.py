@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,27 @@ def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
         except FileNotFoundError as error:
             raise FileNotFoundError(f"--flats: {str(error).removeprefix('path: ')}") from error
     return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
+
+
+def same_capture(args: argparse.Namespace) -> str:
+    """The words of a command line that load the capture of `args` once more."""
+    words = [*args.paths]
+    for name in ("exposure", "kind", "cfa", "black_level", "white_level", "shutter", "row_axis", "roi", "overscan"):
+        value = getattr(args, name)
+        if value is not None and not (name == "row_axis" and value == 0):
+            words += [f"--{name.replace('_', '-')}", _in_words(value)]
+    words += ["--flats", *args.flats] if args.flats else []
+    words += ["--flats-exposure", _in_words(args.flats_exposure)] if args.flats_exposure else []
+    return shlex.join(words)
+
+
+def _in_words(value: Any) -> str:
+    """An option's value as it is typed: numbers and spans with commas."""
+    if isinstance(value, tuple | list):
+        spans = all(isinstance(one, tuple) for one in value)
+        ends = [":".join("" if end is None else str(end) for end in one) for one in value] if spans else value
+        return ",".join(one if isinstance(one, str) else f"{one:g}" for one in ends)
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _tell_exposures(stack: FrameStack) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 import hsnoise
 from hsnoise import _enhance, _options, _sample, cameras, report
 from hsnoise._arguments import counter
-from hsnoise._loading import load_capture, model_of
+from hsnoise._loading import load_capture, model_of, same_capture
 from hsnoise._output import frames_file, write_atomically, write_figure
 from hsnoise._progress import busy, fit_with_progress
 from hsnoise._sample import draw, metadata_of
@@ -166,7 +166,7 @@ def _fit(args: argparse.Namespace) -> None:
         written.append(str(args.maps))
     _tell_fit(fit, console)
     console.print(f"\nWritten to {out}/: {', '.join(written)}\n", markup=False, soft_wrap=True)
-    compare = f"hsnoise compare {args.paths[0]}{' ...' if args.paths[1:] else ''} --model {out / 'model.json'}"
+    compare = f"hsnoise compare {same_capture(args)} --model {out / 'model.json'}"
     console.print(MEANING.format(LOOK[fit.method].format(compare)), markup=False)
 
 

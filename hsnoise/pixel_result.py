@@ -109,12 +109,12 @@ def _in_electrons(name: str) -> bool:
 
 def _outcome(pixel: PixelFit) -> str:
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
-    if pixel.flats is not None:
-        return "pixels differ: gain from the flats, read noise from each pixel over time"
-    if not told:
-        return "pixels differ: one exposure, no gain"
+    if pixel.flats is not None and pixel.determined:
+        return "gain from the flats, read noise from each pixel over time"
+    if not told or not pixel.determined:
+        return "each pixel over time, no gain"
     chi2 = ", ".join(f"{t.chi2 / max(t.dof, 1):.2f}" for t in told)
-    return f"pixels differ: gain from {sum(len(t.classes.pixels) for t in told)} classes of pixels, chi2 {chi2}"
+    return f"gain from {sum(len(t.classes.pixels) for t in told)} classes of pixels, chi2 per degree of freedom {chi2}"
 
 
 def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
