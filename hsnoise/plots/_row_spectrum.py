@@ -62,10 +62,12 @@ def row_spectrum(fit) -> Figure:
 
 
 def has_row_spectrum(fit) -> bool:
-    """Whether the frames show the row gain; where pixels differ, only one that was found there."""
+    """Whether the frames show the row gain; where pixels differ, only one that was found in the darks."""
     if not fit.summary.histograms or fit.physics.row_sigma is None:
         return False
-    return fit.transfer is None or bool(transfers_of(fit)) and bool(np.max(fit.physics.row_sigma) > 0)
+    if fit.transfer is None:
+        return True
+    return bool(transfers_of(fit)) and fit.transfer.flats is None and bool(np.max(fit.physics.row_sigma) > 0)
 
 
 def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:
