@@ -16,6 +16,7 @@ from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy,
 from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3
+SHOWN_IN_DARKS = 1e-3  # row gain that flats may know, but no dark shows, is below
 SMALLEST_SIGMA = 1e-6
 FAINT = 0.01  # of the least power that is measured: a row gain below that is left out
 ALONE = "row gain alone"
@@ -62,12 +63,12 @@ def row_spectrum(fit) -> Figure:
 
 
 def has_row_spectrum(fit) -> bool:
-    """Whether the frames show the row gain; where pixels differ, only one that was found in the darks."""
+    """Whether the frames show the row gain; where pixels differ, only one that is large enough for darks to show."""
     if not fit.summary.histograms or fit.physics.row_sigma is None:
         return False
     if fit.transfer is None:
         return True
-    return bool(transfers_of(fit)) and fit.transfer.flats is None and bool(np.max(fit.physics.row_sigma) > 0)
+    return bool(transfers_of(fit)) and bool(np.max(fit.physics.row_sigma) > SHOWN_IN_DARKS)
 
 
 def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:
