@@ -81,8 +81,7 @@ class Problem:
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
         """Variances and directions of the covariance of the base coordinates over their sizes."""
         slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12) * self.sizes
-        covariance = self._base_covariance()
-        unknown = ~np.isfinite(np.diagonal(covariance))
+        covariance, unknown = self._base_covariance()
         covariance[unknown], covariance[:, unknown] = 0.0, 0.0
         covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
         covariance = covariance / slope[:, None] / slope[None, :]
@@ -90,15 +89,14 @@ class Problem:
         share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
         return np.linalg.eigh(covariance * share[:, None] * share[None, :])
 
-    def _base_covariance(self) -> np.ndarray:
-        """Covariance of the base fit in the order of the coordinates; infinite variance of what it did not fit."""
-        names = labels(self.coordinates, self.base.params.channels)
-        known = {name: i for i, name in enumerate(self.base.names)}
+    def _base_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance of the base fit in the order of the coordinates, and which of these it did not fit."""
+        names, fitted = labels(self.coordinates, self.base.params.channels), self.base.names
         covariance = np.diag(np.full(len(names), np.inf))
-        here = [i for i, name in enumerate(names) if name in known]
-        there = [known[names[i]] for i in here]
+        here = [i for i, name in enumerate(names) if name in fitted]
+        there = [fitted.index(names[i]) for i in here]
         covariance[np.ix_(here, here)] = self.base.covariance[np.ix_(there, there)]
-        return covariance
+        return covariance, ~np.isfinite(np.diagonal(covariance))
 
     @cached_property
     def whiten(self) -> np.ndarray:

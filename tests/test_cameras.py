@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hsnoise.cameras import canon_5d3, grasshopper3
+from hsnoise.effects import Gain
 from hsnoise.model import sample_dark
 
 TABLE_2 = {  # of the paper: row-gain variance, gain, dark current, read-noise variance
@@ -49,3 +50,9 @@ def test_dark_frames_have_the_mean_and_spread_of_the_table():
     within = red.var(axis=2, ddof=1).ravel()
     expected = gain**2 * (1 + beta) * (mean_e + read) + 1 / 12  # rounding adds its 1/12
     assert abs(within.mean() - expected) < 5 * within.std() / np.sqrt(within.size)
+
+
+def test_an_effect_of_the_same_class_takes_the_place_of_the_old_one():
+    changed = canon_5d3().add(Gain(1.0))
+    assert changed.names == canon_5d3().names
+    assert set(np.asarray(changed["gain"].value)) == {1.0}

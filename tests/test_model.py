@@ -329,18 +329,10 @@ def test_wrong_types_are_named():
         NoiseModel([Gain], cfa="mono", shutter="rolling", exposure_s=0.05)
 
 
-def test_an_effect_of_the_same_class_takes_the_place_of_the_old_one():
-    changed = canon_5d3().add(Gain(1.0))
-    assert changed.names == canon_5d3().names
-    assert set(np.asarray(changed["gain"].value)) == {1.0}
-
-
 def test_wrong_models_are_refused():
-    class OtherGain(Gain):
-        """Another effect of the same name."""
-
+    another = type("OtherGain", (Gain,), {"__doc__": "Another effect of the same name."})
     with pytest.raises(ValueError, match="gain given twice"):
-        canon_5d3().add(OtherGain(1.0))
+        canon_5d3().add(another(1.0))
     with pytest.raises(KeyError, match="no effect 'glow' in this model, which has shot_noise"):
         canon_5d3().remove("glow")
     with pytest.raises(ValueError, match="gain.value: expected a scalar or one value per channel, R, G, B"):
