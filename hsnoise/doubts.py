@@ -17,7 +17,14 @@ from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
 from hsnoise.pixels.oddities import oddities_of, pixels_apart
-from hsnoise.pixels.structure import can_be_transferred, full_of_hits, has_patterns, noise_spread, static_of
+from hsnoise.pixels.structure import (
+    can_be_transferred,
+    full_of_hits,
+    has_patterns,
+    noise_spread,
+    static_of,
+    variance_grows,
+)
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
@@ -43,6 +50,8 @@ def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
         return False
     if not _several(found):  # then flats do; a likelihood adds nothing, and rows and columns of a real sensor bend it
         return summary.flats is not None and has_patterns(found)
+    if variance_grows(found):
+        return False
     pixel = measure(found, replace(summary, flats=None))
     return not pixel.determined and not _grows(pixel)
 

@@ -230,8 +230,11 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     theta = covariance @ design.T @ (level / error)
     left = (level - theta[0] - theta[1] * t) / error
     covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
-    errors = np.sqrt(np.diagonal(covariance))
-    return (float(theta[1]), float(errors[1])), (float(theta[0]), float(errors[0]))
+    slope_error = float(np.sqrt(covariance[1, 1]))
+    # Pixels differ in growth, so that the median's is no straight line: back to 0 s from the shortest exposure.
+    shortest = int(t.argmin())
+    black = float(level[shortest] - theta[1] * t[shortest])
+    return (float(theta[1]), slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
 
 
 def _level(plane: Plane) -> float:

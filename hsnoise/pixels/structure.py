@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from hsnoise.pixels.classes import HOT_SIGMAS
 from hsnoise.pixels.survey import Group, Survey
@@ -12,6 +13,7 @@ from hsnoise.pixels.survey import Group, Survey
 WINSOR_SIGMAS = 5.0
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+GROWN = 0.1  # of the variance of the shortest exposure
 HITS = 10.0  # temporal variance of all pixels over that of the typical one
 SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
@@ -89,6 +91,24 @@ def pixels_differ(found: Survey) -> bool:
             if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
                 return True
         if _always_bright(found, c) > MANY_HOT:
+            return True
+    return False
+
+
+def variance_grows(found: Survey) -> bool:
+    """Whether the temporal variance of the typical pixel grows with exposure beyond chance, in some colour."""
+    groups = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    for c in range(len(found.channels)):
+        ends = []
+        for group in (groups[0], groups[-1]):
+            variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.planes if p.channel == c])
+            middle = float(np.median(variance))
+            width = 1.4826 * float(np.median(np.abs(variance - middle)))
+            # Of few frames the median lies below the mean, by the same factor in all pixels.
+            share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
+            ends.append((middle / share, 1.25 * width / share / np.sqrt(len(variance))))
+        (low, low_error), (high, high_error) = ends
+        if high - low > max(SIGNIFICANT * np.hypot(low_error, high_error), GROWN * low):
             return True
     return False
 

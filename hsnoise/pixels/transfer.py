@@ -113,16 +113,17 @@ class _Line:
 def pixel_transfer(classes: Classes) -> Transfer | None:
     """The gain of one channel; None where too few classes can be measured."""
     sigma, loose = classes.pedestal_sigma_dn.copy(), np.full(len(classes.exposure_s), LOOSE_DN)
-    free = _line(classes, loose, ALIKE[0])
+    alike, line = ALIKE[0], _line(classes, sigma, ALIKE[0])
+    if line is None:
+        return None
+    for wider in ALIKE[1:]:  # pixels differ in read noise, too: as far as that brings them nearer to the line
+        other = _line(classes, sigma, wider)
+        if line.chi2 < OFF_LINE * line.dof or other is None or other.chi2 > NEARER * line.chi2:
+            break
+        alike, line = wider, other
+    free = _line(classes, loose, alike)
     if free is None:
         return None
-    alike = ALIKE[0]
-    for wider in ALIKE[1:]:  # pixels differ in read noise, too: as far as that brings them nearer to the line
-        other = _line(classes, loose, wider)
-        if free.chi2 < OFF_LINE * free.dof or other.chi2 > NEARER * free.chi2:
-            break
-        free, alike = other, wider
-    line = _line(classes, sigma, alike)
     moved = np.zeros(len(sigma), bool)
     chance = max(free.chi2 / free.dof, 1.0)
     while line.off - free.off > MOVED**2 * chance and not moved.all():
