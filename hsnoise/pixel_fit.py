@@ -239,6 +239,8 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
 
 def _level(plane: Plane) -> float:
     """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
+    if plane.narrow_dn is not None:  # most pixels hold one count, and the median is that
+        return float(plane.row_mean_dn.mean())
     return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 
 
