@@ -32,7 +32,7 @@ from hsnoise.statistics import Summary
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
 HEADER_SHARE = 0.08  # of a gain that a header states
-BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.3  # the last of the signal at the shortest exposure
+BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last of the signal at the shortest exposure
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
