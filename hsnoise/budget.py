@@ -142,7 +142,7 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
     """Split the counts of each exposure and colour into the components of the three-dimensional noise decomposition.
 
     One pass over the frames, one in memory at a time; what is told of single pixels comes from evenly spread rows of
-    sensors above 4 Mpixel.
+    sensors above 2 Mpixel, or 1 Mpixel where there are more than two exposures.
 
     Args:
         stack: FrameStack, or with FrameStack's keywords an array [frame, row, column] or [exposure, frame, row,

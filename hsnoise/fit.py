@@ -32,7 +32,7 @@ from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
 
 OUTLIERS_FROM = 1e-4
-PROBE_PIXELS, PROBE_FRAMES = 1 << 21, 16  # of each exposure, that tell whether pixels differ
+PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, that tell whether pixels differ
 SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")

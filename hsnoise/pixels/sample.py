@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_PIXELS = 1 << 22  # of an exposure that are looked at one by one
-MOST_OF_ALL = 1 << 24  # of all exposures together
-MOST_COUNTS = 1 << 25  # pixels times frames of one exposure in memory
+MOST_PIXELS = 1 << 21  # of an exposure that are looked at one by one
+MOST_OF_ALL = 1 << 22  # of all exposures together
+MOST_COUNTS = 1 << 24  # pixels times frames of one exposure in memory
 MOST_OF_SPREAD = 100_000  # pixels that tell the width of a distribution
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from what lies within
 FAR_FRAME = 5.0  # deviations of the frames' offsets from which one of them is an outlier
