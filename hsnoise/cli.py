@@ -129,7 +129,7 @@ def _can_be_improved(stack: FrameStack, out: Path, source: dict[str, Any]) -> bo
     print(stack)
     _tell_fit(fit, Console(highlight=False, soft_wrap=True))
     print(f"Written to {out}/: {', '.join(written)}\n")
-    return not fit.withheld
+    return fit.has_gain
 
 
 def _simulated(out: Path) -> tuple[FrameStack, NoiseModel]:

@@ -123,7 +123,7 @@ def checked(result: FitResult, found: Survey) -> FitResult:
 
 def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     """Which parameters are withheld, what is known instead, and which capture would determine them."""
-    if not any(name.startswith("gain") for name in result.withheld):
+    if result.has_gain:
         return
     pixel: PixelFit = result.transfer
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
@@ -163,7 +163,7 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
     for channel in pixel.channels:
         t: Transfer | None = channel.transfer
         of = "" if channel.name == "mono" else f" of {channel.name}"
-        if t is None or result.withheld or pixel.flats is not None:
+        if t is None or not result.has_gain or pixel.flats is not None:
             continue  # the gain does not come from there
         if t.chi2 > OFF_LINE * max(t.dof, 1):
             yield (
@@ -177,7 +177,7 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
 def _moved_pedestals(result: FitResult) -> Iterator[str]:
     """Pedestals that moved: the gain does not rest on them then."""
     pixel = result.transfer
-    for channel in pixel.channels if pixel is not None and pixel.flats is None and not result.withheld else ():
+    for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
         t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
         if t is not None and t.moved.any():
             e = int(np.argmax(t.moved))
@@ -211,7 +211,7 @@ def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
     """Clipping of pixels whose noise differs: its correction takes the noise of a class for one."""
-    if result.transfer is None or result.withheld:
+    if result.transfer is None or not result.has_gain:
         return
     for c, _ in enumerate(found.channels):
         clipped = max((g.clipped_share[c] for g in found.darks if g.n_frames > 1), default=0.0)
@@ -282,7 +282,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
     if not bounds or not np.isfinite(max(bounds)):
         return
     bound, gain = max(bounds), float(np.mean(np.asarray(result.physics.gain)))
-    electrons = "" if result.withheld else f", {bound / gain:.3g} e-"
+    electrons = f", {bound / gain:.3g} e-" if result.has_gain else ""
     yield (
         f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
         f" {bound:.2g} DN{electrons}. A higher gain setting, or more bits, would show it."
@@ -310,7 +310,7 @@ def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
 def _stated_gain(result: FitResult, found: Survey) -> Iterator[str]:
     """A gain that the header states, against the fitted one."""
     stated = None if result.stack is None else result.stack.stated_gain
-    if stated is None or any(name.startswith("gain") for name in result.withheld):
+    if stated is None or not result.has_gain:
         return
     rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
     value, error = float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))

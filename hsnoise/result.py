@@ -75,6 +75,11 @@ class FitResult:
         """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
         return self.converged and not self.grave
 
+    @property
+    def has_gain(self) -> bool:
+        """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
+        return not any(name.split(".")[0] == "gain" for name in self.withheld)
+
     @cached_property
     def pixels(self) -> PixelMaps:
         """Maps of offset, dark current, noise and flags of each pixel; the frames are read once more.
@@ -83,8 +88,7 @@ class FitResult:
         """
         if self.stack is None:
             raise ValueError("pixels: this fit has no frames, it was made from a Summary or from flats")
-        known = not any(name.startswith("gain") for name in self.withheld)
-        return pixel_maps(self.stack, np.asarray(self.physics.gain) if known else None)
+        return pixel_maps(self.stack, np.asarray(self.physics.gain) if self.has_gain else None)
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:

@@ -23,13 +23,12 @@ def of_fit(fit) -> dict[str, Figure]:
     if fit.method == "synthetic":
         return {}
     conditional = fit.transfer is not None
-    grows = not any(name.startswith("gain") for name in fit.withheld)
     drawings = {
         "photon_transfer": (photon_transfer, has_photon_transfer(fit)),
         "histograms": (histograms, bool(fit.summary.histograms)),
         "row_spectrum": (row_spectrum, has_row_spectrum(fit)),
-        "pixel_transfer": (pixel_transfer, grows and bool(transfers_of(fit))),
-        "dark_current": (dark_current, grows and bool(transfers_of(fit))),
+        "pixel_transfer": (pixel_transfer, fit.has_gain and bool(transfers_of(fit))),
+        "dark_current": (dark_current, fit.has_gain and bool(transfers_of(fit))),
         "pixel_map": (pixel_map, conditional and max(fit.summary.n_frames, default=0) > 1),
     }
     return {name: draw(fit) for name, (draw, there) in drawings.items() if there}
