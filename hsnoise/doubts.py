@@ -1,7 +1,7 @@
 """No number without a check: what of a fit disagrees with its frames, in sentences, and what is withheld.
 
-The noise budget under the fitted model is set beside the measured one; what headers and the user said (gain, black
-level, colours, white level) is tested against the frames; a gain that no growth of signal carries is withheld.
+What headers and the user said (gain, black level, colours) is tested against the frames; a gain that no growth of
+signal carries is withheld; frames, lines and pixels that are no measurement are named.
 """
 
 from __future__ import annotations

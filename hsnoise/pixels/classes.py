@@ -23,10 +23,7 @@ JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure from which ped
 FEWEST_FRAMES = 3  # of an exposure that can be halved
 OUTLIER_SIGMAS = 6.0  # a half of a pixel's frames with such a deviation holds a cosmic hit, or a telegraph jump
 LEAST_SCALE_DN = 0.5
-MANY_PIXELS, MANY_TIMES = (
-    500,
-    20.0,
-)  # whose scatter is known; of the median variance: beyond it no noise of the same kind
+MANY_PIXELS = 500  # of a class whose scatter is known
 FILLED = 0.7  # of full scale: above it the response may bend
 HOT_TIMES, HOT_SIGMAS = 3.0, 6.0  # of the median growth, of the chance scatter of a growth: beyond both a pixel is hot
 NEAR_ZERO_SIGMAS = 4.0  # above 0 counts from which clipping takes nothing from the noise

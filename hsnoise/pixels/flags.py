@@ -19,17 +19,18 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     if not halves or halves[0][0] is None:
         return np.zeros(0, np.uint8)
     flags = np.zeros(sum(h.level_dn.shape[1] for h in halves[0]), np.uint8)
-    flags[found.stuck(channel)] |= FLAGS["stuck"]
+    stuck = found.stuck(channel)
+    flags[stuck] |= FLAGS["stuck"]
     lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     if lit:
         flags[_dead(found, channel)] |= FLAGS["dead"]
     pixels = levels_of(found, channel)
     if pixels is not None:
         growth = slope_over(pixels.exposure_s, pixels.level)
-        moving = np.flatnonzero(~found.stuck(channel))
+        moving = np.flatnonzero(~stuck)
         flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
     dark = [[p.halves for p in g.planes if p.channel == channel] for g in found.darks if g.n_frames > 1]
-    flags[_jumping(dark, len(flags)) & (flags & FLAGS["stuck"] == 0)] |= FLAGS["telegraph"]
+    flags[_jumping(dark, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
 
 
@@ -44,7 +45,7 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
     level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.planes if p.channel == channel]) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
     darks = [g for g in found.darks if g.n_frames > 1]
-    black = np.median(level[bright]) * 0.0
+    black = np.zeros_like(level[bright])
     if darks:
         black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].planes if p.channel == channel])
     signal = level[bright] - black

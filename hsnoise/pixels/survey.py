@@ -30,7 +30,6 @@ class Plane:
     row_mean_dn: np.ndarray
     column_mean_dn: np.ndarray
     frame_means_dn: np.ndarray
-    row_frame_dn: np.ndarray
     components: dict[str, Component]
     halves: Halves | None
     narrow_dn: tuple[float, float] | None
@@ -122,10 +121,12 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
     step, channels = len(tile), len(stack.channels)
     sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
     kept: np.ndarray | None = None
+    odd: OddLines | None = None
     clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
     for f, frame in enumerate(stack.frames(i)):
         if kept is None:
             kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
+            odd = OddLines.of(frame, step)
         kept[f] = frame[rows]
         white = np.inf if stack.white_level is None else stack.white_level
         for p in range(step * step):
@@ -136,11 +137,10 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
             pixels[c] += plane.size
         highest = max(highest, int(frame.max()))
         tick()
-    assert kept is not None  # a group has a frame: FrameStack
+    assert kept is not None and odd is not None  # a group has a frame: FrameStack
     planes = tuple(
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
     )
-    odd = OddLines.of(stack.frame(i, 0), step)
     group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, odd, planes)
     return group, highest
 
@@ -155,7 +155,6 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         row_mean_dn=row_frame.mean(0) + reference,
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
-        row_frame_dn=row_frame - row_frame.mean(0) - row_frame.mean(1, keepdims=True) + row_frame.mean(),
         components=_with_tails(sums.components(), halves, sums.shape),
         halves=halves,
         narrow_dn=_narrow(counts, halves),

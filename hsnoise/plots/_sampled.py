@@ -78,7 +78,7 @@ def _growths(stack: FrameStack) -> list[np.ndarray]:
 def _unit(fit) -> tuple[np.ndarray, str]:
     """What to divide by [channel], and the unit: electrons where the gain is known."""
     gain = np.asarray(fit.physics.gain)
-    known = not any(name.startswith("gain") for name in fit.withheld)
+    known = fit.has_gain
     return (gain, "e$^-$/s") if known else (np.ones_like(gain), "DN/s")
 
 
