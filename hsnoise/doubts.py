@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise._arguments import MOSAIC, looks_like_a_mosaic
-from hsnoise.flat_notes import gain_notes
+from hsnoise.flat_notes import gain_notes, stated_gain_note
 from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit, measure
 from hsnoise.pixel_result import result_of
@@ -31,7 +31,6 @@ from hsnoise.result import FitResult
 from hsnoise.statistics import Summary
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
-HEADER_SHARE = 0.08  # of a gain that a header states
 BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last of the signal at the shortest exposure
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
@@ -309,17 +308,11 @@ def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _stated_gain(result: FitResult, found: Survey) -> Iterator[str]:
     """A gain that the header states, against the fitted one."""
-    stated = None if result.stack is None else result.stack.stated_gain
-    if stated is None or not result.has_gain:
+    if result.stack is None or not result.has_gain:
         return
     rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
-    value, error = float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
-    if abs(value / stated.value_dn_per_e - 1) > max(HEADER_SHARE, 3 * error / value):
-        kind = "is wrong, or nominal" if stated.certain else "is not the gain in e-/DN, or wrong"
-        yield (
-            f"The header says {stated.source}; the frames say {1 / value:.3g} ± {error / value**2:.2g} e-/DN"
-            f" ({value:.4g} DN/e-): the header's number {kind}."
-        )
+    value, error = (float(np.mean([row[i] for row in rows])) for i in (0, 1))
+    yield from stated_gain_note(result.stack.stated_gain, value, error)
 
 
 def _black_level(result: FitResult, found: Survey) -> Iterator[str]:

@@ -12,7 +12,7 @@ from hsnoise.result import FitResult
 
 FALLING_BLACK = 0.005  # of the signal, by which the overscan differs from darks
 BLACK_SIGMAS = 5.0
-WRONG, WRONG_SIGMAS = 0.1, 4.0  # of a stated gain: relative difference, standard errors
+WRONG, WRONG_SIGMAS = 0.08, 3.0  # of a stated gain: relative difference, standard errors
 
 
 def flat_notes(result: FitResult) -> list[str]:
@@ -101,10 +101,11 @@ def stated_gain_note(stated: StatedGain | None, gain_dn_per_e: float, error: flo
     """That a gain which headers state is not the sensor's; nothing where they agree or state none."""
     if stated is None or not np.isfinite(gain_dn_per_e):
         return []
-    off = stated.value_dn_per_e - gain_dn_per_e
-    if abs(off) < max(WRONG * gain_dn_per_e, WRONG_SIGMAS * error):
+    off = abs(stated.value_dn_per_e - gain_dn_per_e)
+    if off <= max(WRONG * stated.value_dn_per_e, WRONG_SIGMAS * error):
         return []
+    kind = "is wrong or nominal" if stated.certain else "is wrong, or no gain in e-/DN"
     return [
         f"The header states {stated.source}, but these frames say {1 / gain_dn_per_e:.3g} e-/DN"
-        f" ({gain_dn_per_e:.4g} DN/e-): the header's value is wrong or nominal."
+        f" ({gain_dn_per_e:.4g} ± {error:.2g} DN/e-): the header's value {kind}."
     ]
