@@ -175,7 +175,7 @@ def budget_of(found: Survey, stack: FrameStack) -> NoiseBudget:
 
 
 def _row(found: Survey, group: Group, channel: int) -> BudgetRow:
-    planes = [p for p in group.planes if p.channel == channel]
+    planes = group.of(channel)
     components = {name: _mean([p.components[name] for p in planes]) for name in COMPONENTS}
     return BudgetRow(
         exposure_s=group.exposure_s,
@@ -224,10 +224,10 @@ def _told_flags(found: Survey, channel: int) -> dict[str, float]:
 
 def _spreads(found: Survey, channel: int) -> dict[str, PixelSpread]:
     """How offset, dark signal and temporal noise differ between the sampled pixels."""
-    darks = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     if not darks:
         return {}
-    halves = [p.halves for p in darks[0].planes if p.channel == channel]
+    halves = [p.halves for p in darks[0].of(channel)]
     level = np.concatenate([h.level_dn for h in halves], 1)
     spreads = {"offset": _spread(level, "DN")}
     pixels = levels_of(found, channel)

@@ -224,7 +224,7 @@ def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _falling(result: FitResult, found: Survey) -> Iterator[str]:
     """A level that falls with exposure by more than the noise of a pixel: swapped exposures, or a subtracted dark."""
-    darks = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     for one, other in zip(darks, darks[1:], strict=False):
         if other.exposure_s == one.exposure_s:
             continue
@@ -276,7 +276,7 @@ def _of_flats(result: FitResult) -> list[str]:
 
 def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
     """What read noise is at most, where it is narrower than a count."""
-    darks = [g for g in found.darks if g.n_frames > 1]
+    darks = found.repeated_darks
     bounds = [p.narrow_dn[1] for p in min(darks, key=lambda g: g.exposure_s).planes if p.narrow_dn] if darks else []
     if not bounds or not np.isfinite(max(bounds)):
         return

@@ -130,8 +130,7 @@ def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> T
 
 def _offset(found: Survey, c: int) -> tuple[float, float]:
     """Standard deviation of offsets where exposures do not tell them from dark current."""
-    groups = [g for g in found.darks if g.n_frames > 1]
-    if not groups:
+    if found.shortest is None:
         return 0.0, np.inf
     pattern, low_side = _pattern(found, c)
     return offset_sigma(pattern, 0.0, low_side)
@@ -139,17 +138,15 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
     """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
-    group = min((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
     rows = len(found.sampled_rows) * plane_rows(found)
-    levels = [p.halves.level_dn for p in group.planes if p.channel == c]
+    levels = [p.halves.level_dn for p in _shortest(found, c)]
     low_side = float(np.mean([low_side_sigma(one, rows) for one in levels]))
     return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
 
 
 def _shortest(found: Survey, c: int) -> list[Plane]:
     """The planes of a channel at the shortest dark exposure of several frames; empty without one."""
-    groups = [g for g in found.darks if g.n_frames > 1]
-    return [p for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == c] if groups else []
+    return [] if found.shortest is None else found.shortest.of(c)
 
 
 def _shadings(found: Survey, c: int) -> dict[str, Shading]:
@@ -181,11 +178,7 @@ def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str
 
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
     """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
-    groups = [g for g in found.darks if g.n_frames > 1]
-    if not groups:
-        return None
-    shortest = min(groups, key=lambda g: g.exposure_s)
-    return next((p.narrow_dn for p in shortest.planes if p.channel == c), None)
+    return next((p.narrow_dn for p in _shortest(found, c)), None)
 
 
 def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
@@ -197,11 +190,10 @@ def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
 
 def _temporal(found: Survey, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels at the shortest exposure, DN^2, outliers set apart, and its standard error."""
-    groups = [g for g in found.darks if g.n_frames > 1]
-    if not groups:
+    group = found.shortest
+    if group is None:
         return 0.0, UNKNOWN
-    group = min(groups, key=lambda g: g.exposure_s)
-    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.planes if p.channel == c]).astype(np.float64)
+    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
     variance = variance[~found.stuck(c)]
     if not (variance > 0).any():
         return 0.0, UNKNOWN
@@ -214,7 +206,7 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     """Growth of the median pixel with exposure, DN/s, and level without signal, DN, each with its standard error."""
     darks = found.darks
     t = np.array([g.exposure_s for g in darks])
-    planes = [[p for p in g.planes if p.channel == c] for g in darks]
+    planes = [g.of(c) for g in darks]
     level = np.array([np.mean([_level(p) for p in of]) for of in planes])
     frames = [
         np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
@@ -253,9 +245,9 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Po
 
 def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
     """Variance of the gain of rows: how the variance of row means grows with the square of the signal; its error."""
-    groups = [g for g in found.darks if g.n_frames > 1]
+    groups = found.repeated_darks
     signal = growth * np.array([g.exposure_s for g in groups])
-    parts = [[p.components["row_x_frame"] for p in g.planes if p.channel == c] for g in groups]
+    parts = [[p.components["row_x_frame"] for p in g.of(c)] for g in groups]
     y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
     error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
     if len(groups) < 2 or np.ptp(signal) <= 0:

@@ -76,11 +76,11 @@ class Levels(NamedTuple):
 
 def levels_of(found: Survey, channel: int) -> Levels | None:
     """The sampled pixels of one channel that are not stuck; None without two dark exposures of two frames."""
-    groups = [g for g in found.darks if g.n_frames > 1]
+    groups = found.repeated_darks
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
-    halves = [[p.halves for p in g.planes if p.channel == channel] for g in groups]
+    halves = [[p.halves for p in g.of(channel)] for g in groups]
     moving = ~found.stuck(channel)
     level, variance, peak = (
         np.stack([np.concatenate([getattr(h, name) for h in of], 1)[:, moving] for of in halves])

@@ -15,7 +15,7 @@ RARE = 1e-3  # chance of a variance so high, in each half of the frames
 
 def flags_of(found: Survey, channel: int) -> np.ndarray:
     """Bits of FLAGS of each sampled pixel of one channel [pixel]; those that the frames do not tell are not set."""
-    halves = [[p.halves for p in g.planes if p.channel == channel] for g in found.groups if g.n_frames > 1]
+    halves = [[p.halves for p in g.of(channel)] for g in found.groups if g.n_frames > 1]
     if not halves or halves[0][0] is None:
         return np.zeros(0, np.uint8)
     flags = np.zeros(sum(h.level_dn.shape[1] for h in halves[0]), np.uint8)
@@ -29,7 +29,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
         growth = slope_over(pixels.exposure_s, pixels.level)
         moving = np.flatnonzero(~stuck)
         flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
-    dark = [[p.halves for p in g.planes if p.channel == channel] for g in found.darks if g.n_frames > 1]
+    dark = [[p.halves for p in g.of(channel)] for g in found.darks if g.n_frames > 1]
     flags[_jumping(dark, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
 
@@ -42,12 +42,12 @@ def counts_of(flags: np.ndarray) -> dict[str, float]:
 def _dead(found: Survey, channel: int) -> np.ndarray:
     """Pixels that hardly answer to light."""
     flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
-    level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.planes if p.channel == channel]) for g in flats]
+    level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.of(channel)]) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
-    darks = [g for g in found.darks if g.n_frames > 1]
+    darks = found.repeated_darks
     black = np.zeros_like(level[bright])
     if darks:
-        black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].planes if p.channel == channel])
+        black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].of(channel)])
     signal = level[bright] - black
     return signal < DIM * np.median(signal)
 

@@ -91,7 +91,7 @@ def _band(found: Survey) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     shape = (len(found.sampled_rows), found.shape[1])
     offset, rate, noise = (np.empty(shape, np.float32) for _ in range(3))
     flags = np.empty(shape, np.uint8)
-    darks = [g for g in found.darks if g.n_frames > 1]
+    darks = found.repeated_darks
     t = np.array([g.exposure_s for g in darks])
     shortest = int(t.argmin())
     of_channel = [flags_of(found, c) for c in range(len(found.channels))]

@@ -71,8 +71,7 @@ def _colours(found: Survey) -> Iterator[str]:
         return
     for group in found.darks[:1]:
         noise = [
-            np.mean([p.components["temporal"].variance_dn2 for p in group.planes if p.channel == c])
-            for c in range(len(found.channels))
+            np.mean([p.components["temporal"].variance_dn2 for p in group.of(c)]) for c in range(len(found.channels))
         ]
         for c, name in enumerate(found.channels):
             if noise[c] < QUIET**2 * np.nanmax(noise):

@@ -31,7 +31,7 @@ class Static(NamedTuple):
 
 def static_of(found: Survey, group: Group, channel: int) -> Static | None:
     """The static variance of the pixels of one channel in one exposure; None where halves of the frames do not tell."""
-    planes = [p for p in group.planes if p.channel == channel]
+    planes = group.of(channel)
     if group.n_frames < 2:
         return None
     products, temporal = [], []
@@ -97,11 +97,11 @@ def pixels_differ(found: Survey) -> bool:
 
 def variance_grows(found: Survey) -> bool:
     """Whether the temporal variance of the typical pixel grows with exposure beyond chance, in some colour."""
-    groups = sorted((g for g in found.darks if g.n_frames > 1), key=lambda g: g.exposure_s)
+    groups = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     for c in range(len(found.channels)):
         ends = []
         for group in (groups[0], groups[-1]):
-            variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.planes if p.channel == c])
+            variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)])
             middle = float(np.median(variance))
             width = 1.4826 * float(np.median(np.abs(variance - middle)))
             # Of few frames the median lies below the mean, by the same factor in all pixels.
@@ -126,7 +126,7 @@ def noise_spread(found: Survey, channel: int) -> float:
     groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
     if not groups:
         return 0.0
-    halves = [p.halves for p in min(groups, key=lambda g: g.exposure_s).planes if p.channel == channel]
+    halves = [p.halves for p in min(groups, key=lambda g: g.exposure_s).of(channel)]
     a, b = np.concatenate([h.variance_dn2 for h in halves], 1).astype(np.float64)
     top = np.quantile(np.concatenate([a, b]), 0.999)
     a, b = np.minimum(a, top), np.minimum(b, top)
@@ -136,8 +136,7 @@ def noise_spread(found: Survey, channel: int) -> float:
 
 def has_patterns(found: Survey) -> bool:
     """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
-    groups = [g for g in found.darks if g.n_frames > 1]
-    for plane in min(groups, key=lambda g: g.exposure_s).planes if groups else ():
+    for plane in found.shortest.planes if found.shortest is not None else ():
         noise = plane.components["temporal"].variance_dn2
         for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
             one = plane.components[name]
@@ -148,10 +147,10 @@ def has_patterns(found: Survey) -> bool:
 
 def _always_bright(found: Survey, channel: int) -> float:
     """Share of pixels that stand out in every frame of the longest exposure: hits and jumps do not."""
-    several = [g for g in found.darks if g.n_frames > 1]
+    several = found.repeated_darks
     if not several:
         return 0.0
-    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).planes if p.channel == channel]
+    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).of(channel)]
     lowest = np.concatenate([h.lowest for h in halves]).astype(np.float64)
     sigma = float(np.sqrt(np.median(np.concatenate([h.pair_variance_dn2 for h in halves]))))
     level = float(np.median(np.concatenate([h.level_dn for h in halves], 1)))
@@ -160,7 +159,7 @@ def _always_bright(found: Survey, channel: int) -> float:
 
 def can_be_transferred(found: Survey) -> bool:
     """Whether pixels over time show their noise: hardly clipped, and not ruled by streaks of rows."""
-    groups = [g for g in found.darks if g.n_frames > 1]
+    groups = found.repeated_darks
     if not groups or max(g.clipped_share.max() for g in groups) > CLIPPED:
         return False
     # Offsets of rows are taken off; a gain of rows grows with the signal, and changes the noise within them.

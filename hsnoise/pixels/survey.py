@@ -63,6 +63,10 @@ class Group:
     odd_lines: OddLines
     planes: tuple[Plane, ...]
 
+    def of(self, channel: int) -> list[Plane]:
+        """The planes of one channel."""
+        return [plane for plane in self.planes if plane.channel == channel]
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -77,7 +81,7 @@ class Survey:
 
     def stuck(self, channel: int) -> np.ndarray:
         """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
-        halves = [[p.halves for p in g.planes if p.channel == channel] for g in self.groups if g.n_frames > 1]
+        halves = [[p.halves for p in g.of(channel)] for g in self.groups if g.n_frames > 1]
         still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
         noisy: list[bool] = [
             bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves
@@ -90,6 +94,16 @@ class Survey:
     @property
     def darks(self) -> tuple[Group, ...]:
         return tuple(group for group in self.groups if group.kind == "dark")
+
+    @property
+    def repeated_darks(self) -> tuple[Group, ...]:
+        """The dark exposures of two frames or more: only these tell what stays from what changes."""
+        return tuple(group for group in self.darks if group.n_frames > 1)
+
+    @property
+    def shortest(self) -> Group | None:
+        """The shortest of `repeated_darks`; None without any."""
+        return min(self.repeated_darks, key=lambda group: group.exposure_s, default=None)
 
 
 def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Survey:
