@@ -86,6 +86,17 @@ class PlaneSums:
         return _from_mean_squares(_sums_of_squares(self), n, h, w)
 
 
+def of_neighbouring_rows(row_mean_dn: np.ndarray) -> Component:
+    """What neighbouring rows share in a frame, of row means [frame, row]: a covariance, DN^2; 0 of white rows."""
+    n, h = row_mean_dn.shape
+    if n < 2 or h < 3:
+        return Component(np.nan, np.nan)
+    left = row_mean_dn - row_mean_dn.mean(0)
+    left = left - left.mean(1, keepdims=True)
+    error = float(left.var()) / np.sqrt((n - 1) * (h - 1))
+    return Component(float((left[:, 1:] * left[:, :-1]).sum() / ((n - 1) * (h - 1))), error, chance_dn2=error)
+
+
 def _sums_of_squares(sums: PlaneSums) -> dict[str, float]:
     """Sum of squares of each effect; they add up to that of all counts about their mean."""
     n, (h, w) = sums.n_frames, sums.shape

@@ -11,7 +11,7 @@ import numpy as np
 
 from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
 from hsnoise.coordinates import coordinates_for, labels
-from hsnoise.doubts import carries_no_gain, checked, confirmed
+from hsnoise.doubts import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.flat_gain import judged
@@ -107,17 +107,17 @@ def fit(
     simulated = tuple(name for name in extra if not (differ and name in POPULATION))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
-        return result if found is None else checked(result, found)
+        return result if found is None else checked(result, Evidence(found, result.summary))
     if model is not None:
         _check_complete(model)
     summary = source if isinstance(source, Summary) else _summary_of(source, progress)
-    if differ or measurable and pixels == "auto" and carries_no_gain(found, summary, method):
-        return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), found)
-    result = _pooled(summary, model, method)
     if found is None:
-        return result
-    result = replace(result, stack=source)
-    return checked(confirmed(result, found, summary, model) if pixels == "auto" and method != "line" else result, found)
+        return _pooled(summary, model, method)
+    seen = Evidence(found, summary)
+    if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
+        return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), seen)
+    result = replace(_pooled(summary, model, method), stack=source)
+    return checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen)
 
 
 def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:

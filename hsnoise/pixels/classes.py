@@ -262,7 +262,8 @@ def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
     """
     middle = max(float(np.median(excess)), 1e-6)
     brighter = np.maximum(excess / middle, 1.0) if middle > LEAST_SCALE_DN else 1.0
-    return np.maximum(np.sqrt(np.median(variance) * brighter), LEAST_SCALE_DN)
+    usual = max(float(np.median(variance)), 0.0)  # below 0 by what is taken off of saturated pixels
+    return np.maximum(np.sqrt(usual * brighter), LEAST_SCALE_DN)
 
 
 def _level_scatter(members: list[np.ndarray], level, other, t) -> np.ndarray:

@@ -13,6 +13,8 @@ ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by whic
 LEAST_LEVEL_DN = 0.5
 MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that are worth a sentence
 QUIET = 0.05  # of the other colours' noise: a colour that is dead
+LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel's noise
+LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # of that signal over pixels: less is simulated, more is dark current
 FEWEST = 3  # frames, of which one can be told to be odd
 
 
@@ -76,6 +78,32 @@ def _colours(found: Survey) -> Iterator[str]:
         for c, name in enumerate(found.channels):
             if noise[c] < QUIET**2 * np.nanmax(noise):
                 yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
+
+
+def lit_darks(found: Survey) -> Iterator[str]:
+    """Darks whose pixels rise nearly alike, as light makes them; dark currents differ by far more."""
+    first = found.shortest
+    for c, channel in enumerate(found.channels if first is not None else ()):
+        of = "" if channel == "mono" else f" of channel {channel}"
+        for group in found.repeated_darks:
+            signal = _levels(group, c) - _levels(first, c)
+            rise = float(np.median(signal))
+            noise = float(np.sqrt(np.median(np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]))))
+            a, b = (one - np.median(one) for one in signal)
+            width = float(np.quantile(np.abs(a + b) / 2, 0.99))
+            common = float(np.mean(np.clip(a, -width, width) * np.clip(b, -width, width)))
+            spread = np.sqrt(max(common, 0.0)) / max(rise, 1e-9)
+            if rise > max(LIT_DN, LIT_NOISES * noise) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
+                yield (
+                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN and differ in that by {spread:.2g}"
+                    " of it: dark currents differ by more. Did light get in, or are they flats (kind='flat')?"
+                )
+                break
+
+
+def _levels(group: Group, c: int) -> np.ndarray:
+    """Level of each pixel of a channel in two halves of the frames [half, pixel], DN."""
+    return np.concatenate([p.halves.level_dn for p in group.of(c)], 1).astype(np.float64)
 
 
 def pixels_apart(found: Survey) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise._types import cfa_tile
-from hsnoise.decomposition import COMPONENTS, Component, PlaneSums
+from hsnoise.decomposition import COMPONENTS, Component, PlaneSums, of_neighbouring_rows
 from hsnoise.narrow_noise import narrow_read_noise
 from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
 from hsnoise.stack import FrameStack
@@ -23,6 +23,7 @@ NARROW_DN2 = 0.25  # temporal variance below which rounding is no noise of 1/12 
 class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
+    rows_together: what rows next to each other share in a frame.
     narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
     """
 
@@ -31,6 +32,7 @@ class Plane:
     column_mean_dn: np.ndarray
     frame_means_dn: np.ndarray
     components: dict[str, Component]
+    rows_together: Component
     halves: Halves | None
     narrow_dn: tuple[float, float] | None
 
@@ -170,6 +172,7 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
         components=_with_tails(sums.components(), halves, sums.shape),
+        rows_together=of_neighbouring_rows(row_frame),
         halves=halves,
         narrow_dn=_narrow(counts, halves),
     )

@@ -1,7 +1,8 @@
 """No number without a check: what of a fit disagrees with its frames, in sentences, and what is withheld.
 
-What headers and the user said (gain, black level, colours) is tested against the frames; a gain that no growth of
-signal carries is withheld; frames, lines and pixels that are no measurement are named.
+`_drawn`: the components that carry a parameter, measured and in frames drawn from the fit. `_stated`: what headers and
+the user said (gain, black and white level, shutter, colours). `_choice`: which of two fits to believe. Here: a gain
+that no growth of signal carries, frames, lines and pixels that are no measurement, and the order of all.
 """
 
 from __future__ import annotations
@@ -11,27 +12,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from hsnoise._arguments import MOSAIC, looks_like_a_mosaic
-from hsnoise.flat_notes import gain_notes, stated_gain_note
+from hsnoise.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
+from hsnoise.doubts._drawn import disagreements
+from hsnoise.doubts._evidence import Evidence
+from hsnoise.doubts._stated import stated
+from hsnoise.flat_notes import gain_notes
 from hsnoise.notes import pixel_notes
-from hsnoise.pixel_fit import PixelFit, measure
-from hsnoise.pixel_result import result_of
-from hsnoise.pixels.oddities import oddities_of, pixels_apart
-from hsnoise.pixels.structure import (
-    can_be_transferred,
-    full_of_hits,
-    has_patterns,
-    noise_spread,
-    static_of,
-    variance_grows,
-)
+from hsnoise.pixel_fit import PixelFit
+from hsnoise.pixels.oddities import lit_darks, oddities_of, pixels_apart
+from hsnoise.pixels.structure import noise_spread, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
-from hsnoise.statistics import Summary
 
-APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
-BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last of the signal at the shortest exposure
+__all__ = ["Evidence", "carries_no_gain", "checked", "confirmed"]
+
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
@@ -39,80 +34,14 @@ MANY_HOT = 0.15  # share of pixels
 STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
 
 
-def carries_no_gain(found: Survey, summary: Summary, method: str) -> bool:
-    """Whether darks of several exposures show no growth of signal, so that their likelihood can not tell the gain.
-
-    What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
-    without them.
-    """
-    if method == "line" or not can_be_transferred(found):
-        return False
-    if not _several(found):  # then flats do; a likelihood adds nothing, and rows and columns of a real sensor bend it
-        return summary.flats is not None and has_patterns(found)
-    if variance_grows(found):
-        return False
-    pixel = measure(found, replace(summary, flats=None))
-    return not pixel.determined and not _grows(pixel)
-
-
-def confirmed(result: FitResult, found: Survey, summary: Summary, model) -> FitResult:
-    """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
-    if summary.flats is not None or not can_be_transferred(found) or not _several(found) or full_of_hits(found):
-        return result
-    pixel = measure(found, summary)
-    if not pixel.determined:
-        return result
-    if result.method == "line":
-        failed = "NOT CONVERGE" in result.outcome
-        return _instead(result.outcome, pixel, summary, model, result) if failed else result
-    gain, error = np.asarray(result.physics.gain), _gain_errors(result)
-    off = np.abs(gain - pixel.estimate[: len(gain)])
-    apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)
-    if not apart.any():
-        return result
-    why = f"THE LIKELIHOOD'S GAIN, {gain[apart][0]:.3g} DN/e-, DISAGREES WITH PIXELS OVER TIME"
-    return _instead(why, pixel, summary, model, result)
-
-
-def _several(found: Survey) -> bool:
-    return len({g.exposure_s for g in found.darks if g.n_frames > 1}) > 1
-
-
-def _gain_errors(result: FitResult) -> np.ndarray:
-    return np.array([row[1] for name, row in result.table.items() if name.split(".")[0] == "gain"])
-
-
-def _errors(pixel: PixelFit) -> np.ndarray:
-    return np.sqrt(np.diagonal(pixel.covariance))[: len(pixel.channels)]
-
-
-def _grows(pixel: PixelFit) -> bool:
-    """Whether variance or mean of some colour grows with exposure beyond chance."""
-    return any(c.values[2] > 3 * np.sqrt(c.covariance[2, 2]) for c in pixel.channels)
-
-
-def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResult) -> FitResult:
-    other = result_of(pixel, summary, model, result.stack)
-    return replace(other, outcome=f"{why.partition(';')[0]}; pixel transfer instead")
-
-
-def checked(result: FitResult, found: Survey) -> FitResult:
+def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and the notes of what it does not determine."""
-    checks = (
-        _withheld,
-        _single_frames,
-        _of_transfer,
-        _clipped,
-        _falling,
-        _of_pooling,
-        _stated_gain,
-        _black_level,
-        _mosaic,
-        _odd,
-    )
+    found = seen.survey
+    checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
+    grave += [*stated(result, seen), *oddities_of(found)]
     share = _outlier_share(result)
-    minor = (*pixels_apart(found), *_outliers(result), *_moved_pedestals(result), *_many_hot(result))
+    minor = (*pixels_apart(found), *lit_darks(found), *_outliers(result), *_moved_pedestals(result), *_many_hot(result))
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
     if result.method == "transfer":
@@ -137,7 +66,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
             "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
             f" lies between {low:.3g} and {high:.3g} DN/e-"
         )
-    elif not _several(found):
+    elif len({g.exposure_s for g in found.repeated_darks}) < 2:
         why = "darks of one exposure show no growth of signal"
     else:
         why = "the dark signal of ordinary pixels does not grow with exposure by enough"
@@ -150,8 +79,12 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _named_noise(found: Survey) -> str:
     """What the noise without signal is: with one exposure, that exposure's own, dark shot noise included."""
-    shortest = min(g.exposure_s for g in found.darks if g.n_frames > 1)
-    return "Read noise" if _several(found) or shortest == 0 else f"The noise at {shortest:g} s, shot noise included,"
+    shortest = min(g.exposure_s for g in found.repeated_darks)
+    return (
+        "Read noise"
+        if len({g.exposure_s for g in found.repeated_darks}) > 1 or shortest == 0
+        else f"The noise at {shortest:g} s, shot noise included,"
+    )
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
@@ -304,47 +237,3 @@ def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
             f"Pixels differ: what stays in them is up to {worst:.0%} of what changes, and this fit takes it for noise."
             " Its gain, dark current and read noise may be off by as much; hsnoise improve tells what is missing."
         )
-
-
-def _stated_gain(result: FitResult, found: Survey) -> Iterator[str]:
-    """A gain that the header states, against the fitted one."""
-    if result.stack is None or not result.has_gain:
-        return
-    rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
-    value, error = (float(np.mean([row[i] for row in rows])) for i in (0, 1))
-    yield from stated_gain_note(result.stack.stated_gain, value, error)
-
-
-def _black_level(result: FitResult, found: Survey) -> Iterator[str]:
-    """A black level that was given, against the level of the darks without signal."""
-    given = result.summary.black_level_dn
-    if given is None or result.transfer is None and result.method != "ml" or not _several(found):
-        return
-    pixel = result.transfer if result.transfer is not None else measure(found, replace(result.summary, flats=None))
-    shortest = min(g.exposure_s for g in found.darks)
-    for c, channel in enumerate(pixel.channels):
-        level, error = channel.black_dn
-        clipped = max(g.clipped_share[c] for g in found.darks)
-        if clipped > 1e-4 or not np.isfinite(error):
-            continue
-        back = EXTRAPOLATED * abs(channel.values[2]) * shortest  # the median of growing pixels is no straight line
-        if abs(level - given[c]) > max(BLACK_SIGMAS * error, BLACK_DN, back):
-            of = "" if channel.name == "mono" else f" of {channel.name}"
-            yield (
-                f"The black level{of} was given as {given[c]:.4g} DN; the darks without signal lie at {level:.4g} ±"
-                f" {error:.2g} DN. Leave it out, and it is fitted."
-            )
-
-
-def _mosaic(result: FitResult, found: Survey) -> Iterator[str]:
-    """A colour sensor that was read as mono."""
-    stack = result.stack
-    if stack is None or stack.cfa != "mono" or "dark" not in stack.kind:
-        return
-    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-    if looks_like_a_mosaic(stack.frame(max(darks, key=lambda i: stack.exposure_s[i]), 0)):
-        yield f"The frames are {MOSAIC}."
-
-
-def _odd(result: FitResult, found: Survey) -> Iterator[str]:
-    yield from oddities_of(found)

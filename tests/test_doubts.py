@@ -1,0 +1,93 @@
+"""Does a fit say so when the frames contradict it, or what was given with them? And is it silent when they do not?"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise.doubts import Evidence, checked
+from hsnoise.doubts._drawn import disagreements
+from hsnoise.fit import _surveyed
+
+EXPOSURES_S, FRAMES, SHAPE = (0.1, 0.4, 1.6), 6, (96, 128)
+GAIN, BLACK, READ_E = 2.0, 100.0, 4.0
+
+
+def pixels_that_differ(seed: int = 0, spread: float = 1.0, light: float = 0.0, exposures=EXPOSURES_S, ends_at=65535):
+    """Counts [exposure, frame, row, column] of a sensor with log-normal dark currents, or lit evenly to 1 %."""
+    random = np.random.default_rng(seed)
+    rate = 60 * np.exp(spread * random.standard_normal(SHAPE) - spread**2 / 2)
+    rate = rate + light * (1 + 0.01 * random.standard_normal(SHAPE))
+    signal = np.array(exposures)[:, None, None, None] * rate
+    electrons = random.poisson(np.broadcast_to(signal, (len(exposures), FRAMES, *SHAPE)))
+    counts = BLACK + GAIN * (electrons + READ_E * random.standard_normal(electrons.shape))
+    return np.clip(np.round(counts), 0, ends_at).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def good():
+    return hsnoise.fit(pixels_that_differ(), exposure_s=EXPOSURES_S)
+
+
+def test_a_right_fit_raises_no_doubt(good):
+    assert good.doubts == ()
+    assert good.trustworthy
+    assert good.table["gain"][0] == pytest.approx(GAIN, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "says"),
+    [
+        (lambda p: p["read_noise"].sigma, 6.0, "noise of the pixels"),
+        (lambda p: p["gain"].value, 3.0, "noise of the pixels"),
+        (lambda p: p["black_level"].value, 130.0, "level of the typical pixel"),
+        (lambda p: p["dark_current"].rate, 200.0, "does not grow with exposure"),
+        (lambda p: p["row_gain"].sigma, 0.2, "shares in a frame"),
+    ],
+)
+def test_a_parameter_that_is_wrong_is_seen_in_the_drawn_frames(good, where, value, says):
+    broken = replace(good, params=eqx.tree_at(where, good.params, jax.numpy.full_like(where(good.params), value)))
+    found = _surveyed(good.stack)
+    sentences = list(disagreements(broken, found))
+    assert any(says in sentence for sentence in sentences), sentences
+    assert not checked(broken, Evidence(found, good.summary)).trustworthy
+
+
+def test_a_white_level_below_the_counts_is_named():
+    fit = hsnoise.fit(pixels_that_differ(), exposure_s=EXPOSURES_S, white_level=400)
+    assert any("above the white level" in doubt for doubt in fit.doubts), fit.doubts
+    assert not fit.trustworthy
+
+
+@pytest.mark.parametrize("given", [None, 4095])
+def test_counts_that_end_below_the_white_level_are_named(given):
+    counts = pixels_that_differ(exposures=(0.1, 0.4, 6.4), ends_at=1500)
+    fit = hsnoise.fit(counts, exposure_s=(0.1, 0.4, 6.4), white_level=given)
+    assert any("end at a count of 1500" in doubt for doubt in fit.doubts), fit.doubts
+
+
+def test_the_right_white_level_is_no_doubt():
+    counts = pixels_that_differ(exposures=(0.1, 0.4, 6.4), ends_at=1500)
+    fit = hsnoise.fit(counts, exposure_s=(0.1, 0.4, 6.4), white_level=1500)
+    assert not any("white" in doubt for doubt in fit.doubts), fit.doubts
+
+
+def test_darks_that_are_lit_are_named_and_dark_currents_are_not(good):
+    lit = hsnoise.fit(pixels_that_differ(light=400.0, spread=0.2), exposure_s=EXPOSURES_S)
+    assert any("Did light get in" in doubt for doubt in lit.doubts), lit.doubts
+    warm = hsnoise.fit(pixels_that_differ(exposures=(0.1, 1.6, 6.4)), exposure_s=(0.1, 1.6, 6.4))
+    assert not any("light" in doubt for doubt in warm.doubts), warm.doubts
+
+
+@pytest.mark.parametrize(("coloured", "shutter", "doubted"), [(True, "global", True), (False, "global", False)])
+def test_rows_that_go_on_contradict_a_global_shutter(coloured, shutter, doubted):
+    counts = pixels_that_differ().astype(float)
+    random = np.random.default_rng(1)
+    rows = random.standard_normal((*counts.shape[:2], SHAPE[0] + 7))
+    rows = np.stack([rows[..., k : k + SHAPE[0]] for k in range(8)]).mean(0) * 8**0.5 if coloured else rows[..., 7:]
+    counts = np.round(counts + 2.0 * rows[..., None]).astype(np.uint16)
+    fit = hsnoise.fit(counts, exposure_s=EXPOSURES_S, shutter=shutter)
+    assert any("goes on in the next row" in doubt for doubt in fit.doubts) == doubted, fit.doubts
