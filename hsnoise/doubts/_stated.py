@@ -58,7 +58,7 @@ def _black_level(result: FitResult, seen: Evidence) -> Iterator[str]:
 def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     """Counts that end below the white level, or go on above it."""
     given = result.summary.white_level_dn
-    noisy = [group for group in seen.survey.groups if group.n_frames > 1 and _noise_dn(group) > NOISY_DN]
+    noisy = [group for group in seen.survey.groups if group.n_frames > 1 and group.noise_dn > NOISY_DN]
     if not noisy:
         return
     highest = np.concatenate([_highest(group, seen) for group in noisy])
@@ -71,15 +71,11 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
         )
         return
     piled = int((highest == top).sum())
-    below = int(((highest < top) & (highest >= top - 4 * max(_noise_dn(group) for group in noisy))).sum())
+    below = int(((highest < top) & (highest >= top - 4 * max(group.noise_dn for group in noisy))).sum())
     if piled < max(FEWEST_PILED, PILED * below) or top >= (seen.survey.full_scale_dn if given is None else given) - 1:
         return
     what = "no white level was given" if given is None else f"the white level was given as {given:g} DN"
     yield f"{piled} of the pixels looked at end at a count of {top:g} DN, and {what}: give white_level={top:g}."
-
-
-def _noise_dn(group: Group) -> float:
-    return float(np.sqrt(np.median(np.concatenate([p.halves.pair_variance_dn2 for p in group.planes]))))
 
 
 def _highest(group: Group, seen: Evidence) -> np.ndarray:

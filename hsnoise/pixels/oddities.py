@@ -88,12 +88,11 @@ def lit_darks(found: Survey) -> Iterator[str]:
         for group in found.repeated_darks:
             signal = _levels(group, c) - _levels(first, c)
             rise = float(np.median(signal))
-            noise = float(np.sqrt(np.median(np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]))))
             a, b = (one - np.median(one) for one in signal)
             width = float(np.quantile(np.abs(a + b) / 2, 0.99))
             common = float(np.mean(np.clip(a, -width, width) * np.clip(b, -width, width)))
             spread = np.sqrt(max(common, 0.0)) / max(rise, 1e-9)
-            if rise > max(LIT_DN, LIT_NOISES * noise) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
+            if rise > max(LIT_DN, LIT_NOISES * group.noise_dn) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
                 yield (
                     f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN and differ in that by {spread:.2g}"
                     " of it: dark currents differ by more. Did light get in, or are they flats (kind='flat')?"

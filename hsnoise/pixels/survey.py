@@ -69,6 +69,12 @@ class Group:
         """The planes of one channel."""
         return [plane for plane in self.planes if plane.channel == channel]
 
+    @property
+    def noise_dn(self) -> float:
+        """Temporal noise of the typical pixel, two frames or more; 0 where rounding hides it."""
+        variance = np.concatenate([plane.halves.pair_variance_dn2 for plane in self.planes if plane.halves is not None])
+        return float(np.sqrt(max(float(np.median(variance)), 0.0)))
+
 
 @dataclass(frozen=True)
 class Survey:
