@@ -20,7 +20,7 @@ from hsnoise.flat_notes import gain_notes
 from hsnoise.notes import pixel_notes
 from hsnoise.pixel_fit import PixelFit
 from hsnoise.pixels.oddities import lit_darks, oddities_of, pixels_apart
-from hsnoise.pixels.structure import noise_spread, static_of
+from hsnoise.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.pixels.survey import Survey
 from hsnoise.pixels.transfer import ROUNDING, Transfer
 from hsnoise.result import FitResult
@@ -157,20 +157,13 @@ def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _falling(result: FitResult, found: Survey) -> Iterator[str]:
     """A level that falls with exposure by more than the noise of a pixel: swapped exposures, or a subtracted dark."""
-    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
-    for one, other in zip(darks, darks[1:], strict=False):
-        if other.exposure_s == one.exposure_s:
-            continue
-        fall = np.mean(
-            [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
+    fallen = fall_of(found)
+    if fallen is not None:
+        one, other, fall = fallen
+        yield (
+            f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than the"
+            " noise of a pixel: exposures are swapped, or the camera subtracts its dark signal."
         )
-        noise = np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes]))
-        if fall > noise:
-            yield (
-                f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than the"
-                " noise of a pixel: exposures are swapped, or the camera subtracts its dark signal."
-            )
-            return
 
 
 def _outlier_share(result: FitResult) -> float:

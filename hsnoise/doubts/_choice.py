@@ -9,7 +9,7 @@ import numpy as np
 from hsnoise.doubts._evidence import Evidence
 from hsnoise.pixel_fit import PixelFit
 from hsnoise.pixel_result import result_of
-from hsnoise.pixels.structure import can_be_transferred, full_of_hits, has_patterns, variance_grows
+from hsnoise.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
 from hsnoise.result import FitResult
 from hsnoise.statistics import Summary
 
@@ -25,14 +25,12 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
     found, summary = seen.survey, seen.summary
     if method == "line" or not can_be_transferred(found):
         return False
-    if (
-        not seen.has_exposures
-    ):  # then flats do; a likelihood adds nothing, and rows and columns of a real sensor bend it
+    if not seen.has_exposures:  # flats tell it; a likelihood adds nothing, and rows and columns of real sensors bend it
         return summary.flats is not None and has_patterns(found)
-    if variance_grows(found):
+    fell = fall_of(found) is not None  # pedestals that jump so far pass for a signal
+    if variance_grows(found) and not fell:
         return False
-    pixel = seen.darks
-    return not pixel.determined and not _grows(pixel)
+    return not seen.darks.determined and (fell or not _grows(seen.darks))
 
 
 def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:

@@ -121,6 +121,20 @@ def full_of_hits(found: Survey) -> bool:
     return any(all_of > HITS * max(of, 1e-6) for all_of, of in zip(changing, typical, strict=True))
 
 
+def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
+    """Two dark exposures in order, of which the longer is darker by more than a pixel's noise, and how much."""
+    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
+    for one, other in zip(darks, darks[1:], strict=False):
+        if other.exposure_s == one.exposure_s:
+            continue
+        fall = np.mean(
+            [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
+        )
+        if fall > np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes])):
+            return one, other, float(fall)
+    return None
+
+
 def noise_spread(found: Survey, channel: int) -> float:
     """Relative standard deviation over pixels of the temporal variance at the shortest exposure, by two halves."""
     groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
