@@ -91,3 +91,11 @@ def test_rows_that_go_on_contradict_a_global_shutter(coloured, shutter, doubted)
     counts = np.round(counts + 2.0 * rows[..., None]).astype(np.uint16)
     fit = hsnoise.fit(counts, exposure_s=EXPOSURES_S, shutter=shutter)
     assert any("goes on in the next row" in doubt for doubt in fit.doubts) == doubted, fit.doubts
+
+
+def test_frames_that_were_smoothed_are_named(good):
+    assert all(abs(plane.neighbours_share) < 0.03 for group in _surveyed(good.stack).groups for plane in group.planes)
+    counts = pixels_that_differ().astype(float)
+    fit = hsnoise.fit(np.round((counts + np.roll(counts, 1, 3)) / 2).astype(np.uint16), exposure_s=EXPOSURES_S)
+    assert any("smoothed, denoised" in doubt for doubt in fit.doubts), fit.doubts
+    assert not fit.trustworthy

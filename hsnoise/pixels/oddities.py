@@ -15,12 +15,13 @@ MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that are worth a s
 QUIET = 0.05  # of the other colours' noise: a colour that is dead
 LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel's noise
 LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # of that signal over pixels: less is simulated, more is dark current
+SMOOTHED = 0.1  # of the noise, that neighbouring pixels share
 FEWEST = 3  # frames, of which one can be told to be odd
 
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
     """What is wrong with frames, lines and colours, most important first."""
-    return (*_frames(found), *_lines(found), *_colours(found))
+    return (*_frames(found), *_lines(found), *_colours(found), *_smoothed(found))
 
 
 def name_of(group: Group) -> str:
@@ -78,6 +79,18 @@ def _colours(found: Survey) -> Iterator[str]:
         for c, name in enumerate(found.channels):
             if noise[c] < QUIET**2 * np.nanmax(noise):
                 yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
+
+
+def _smoothed(found: Survey) -> Iterator[str]:
+    """Noise that neighbours share: a pixel's variance is then no measure of its electrons."""
+    planes = [(plane.neighbours_share, group) for group in found.groups for plane in group.planes if group.n_frames > 1]
+    wide = [one for one in planes if one[1].noise_dn > LEAST_LEVEL_DN]
+    share, group = max(wide, key=lambda one: one[0], default=(0.0, None))
+    if group is not None and share > SMOOTHED:
+        yield (
+            f"Neighbouring pixels of a row share {share:.0%} of their noise ({name_of(group)}): the frames were"
+            " smoothed, denoised, resized or demosaiced, or the readout is slow. Gain and noise come out too small."
+        )
 
 
 def lit_darks(found: Survey) -> Iterator[str]:

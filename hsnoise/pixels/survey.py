@@ -11,7 +11,7 @@ import numpy as np
 from hsnoise._types import cfa_tile
 from hsnoise.decomposition import COMPONENTS, Component, PlaneSums, of_neighbouring_rows
 from hsnoise.narrow_noise import narrow_read_noise
-from hsnoise.pixels.sample import Halves, halves_of, sampled_rows
+from hsnoise.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 from hsnoise.stack import FrameStack
 
 NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
@@ -24,6 +24,7 @@ class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
     rows_together: what rows next to each other share in a frame.
+    neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
     """
 
@@ -34,6 +35,7 @@ class Plane:
     components: dict[str, Component]
     rows_together: Component
     halves: Halves | None
+    neighbours_share: float
     narrow_dn: tuple[float, float] | None
 
 
@@ -180,8 +182,22 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         components=_with_tails(sums.components(), halves, sums.shape),
         rows_together=of_neighbouring_rows(row_frame),
         halves=halves,
+        neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )
+
+
+def _neighbours_share(counts: np.ndarray) -> float:
+    """Correlation over a row of what changes from the first frame to the second, outliers and lines left out."""
+    if len(counts) < 2:
+        return float("nan")
+    change = counts[1].astype(np.float32) - counts[0]
+    change -= np.median(change, axis=1, keepdims=True)
+    change -= np.median(change, axis=0)
+    width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
+    change = np.clip(change, -width, width)
+    variance = float(np.mean(change**2, dtype=np.float64))
+    return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0
 
 
 def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
