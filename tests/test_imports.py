@@ -78,5 +78,8 @@ assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
 heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2"} & set(sys.modules)
 assert not heavy, heavy
 assert set(hsnoise.__all__) <= set(dir(hsnoise))
+import hsnoise.cli
+heavy = {"matplotlib", "optax", "skimage", "av"} & set(sys.modules)
+assert not heavy, heavy
 """
     subprocess.run([sys.executable, "-c", code], check=True)

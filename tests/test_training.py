@@ -127,7 +127,7 @@ def test_an_interrupt_keeps_the_steps_until_then(folder, tmp_path, monkeypatch, 
         with pytest.raises(SystemExit):
             run_train(arguments(folder, tmp_path / "run"))
     assert [path.name for path in checkpoints.checkpoints(tmp_path / "run")] == ["checkpoint-00000004.eqx"]
-    capsys.readouterr()
+    assert "the same command goes on where it stopped" in capsys.readouterr().out
     run_train(arguments(folder, tmp_path / "run"))
     assert "Going on from step 4" in capsys.readouterr().out
     for one, other in zip(
