@@ -29,17 +29,18 @@ from rich.console import Console
 from rich.progress import track
 
 import hsnoise
-from benchmarks._clips import LONG, Clip, check_sizes, crops, held_out, read_clips
-from benchmarks._noisy import Camera, at_exposure, matched
-from benchmarks._sheet import Sheet
-from benchmarks._training import Recipe, Trainer, batch_rng, digest_of
-from benchmarks._validation import psnr_db
 from hsnoise import NoiseModel
 from hsnoise._output import write_atomically
 from hsnoise._progress import busy
+from hsnoise._sheet import Sheet
 from hsnoise.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import GREY, display_from_linear, light_of_frames
+from hsnoise.training.clips import LONG, Clip, check_sizes, crops, held_out, read_clips
+from hsnoise.training.noisy import Camera, at_exposure, matched
+from hsnoise.training.presets import Recipe
+from hsnoise.training.steps import Trainer, batch_rng, digest_of
+from hsnoise.training.validation import psnr_db
 from hsnoise.weights import load_network, save_network
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")

@@ -28,12 +28,13 @@ from rich.console import Console
 from rich.table import Table
 
 import hsnoise
-from benchmarks._noisy import camera_of
-from benchmarks._training import Recipe, Trainer, examples
 from hsnoise.effects import ADC
 from hsnoise.physics import evaluate, physics_of
 from hsnoise.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.statistics import summarise, without_counts
+from hsnoise.training.noisy import camera_of
+from hsnoise.training.presets import Recipe
+from hsnoise.training.steps import Trainer, examples
 
 TURN_S = 0.5
 FRAMES, ROWS, COLUMNS = 8, 1024, 1024

@@ -25,7 +25,7 @@ from hsnoise.photometry import GREY, frames_of_display, light_of_frames
 from hsnoise.stack import FrameStack
 from hsnoise.stlstm import STLSTM, enhance
 from hsnoise.video import VIDEO, WRITTEN, frame_rate_of, frames_of, write_video
-from hsnoise.weights import load_network
+from hsnoise.weights import SHIPPED, load_network
 
 RANGES = {"--brighten": (1e-3, 1e3), "--rate": (0.01, 1000.0)}
 CLEAN = 1 / 16  # of the least variance that a network was trained on: less is another kind of video
@@ -35,7 +35,14 @@ BLOCK = 8  # pixels, so many that most of a picture is even within them
 def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     """camera: of raw frames; None for a video of display values."""
     _check(args)
-    net, about = load_network(args.weights)
+    net, about = load_network(args.weights or SHIPPED)
+    if args.weights is None:
+        low, high = about["white_e"]
+        print(
+            f"Weights that come with hsnoise, trained for {about['camera']}, white of {low:.2g} to {high:.2g}"
+            " photoelectrons; --weights takes others",
+            file=sys.stderr,
+        )
     _check_network(args, net, about, camera)
     light = _of_display(args, net) if camera is None else _of_counts(args, camera)
     console = Console(stderr=True)

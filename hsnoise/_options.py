@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import platform
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from hsnoise._output import FRAME_FORMATS
 from hsnoise._types import BAYER_CFAS, SHUTTERS
 from hsnoise.cameras import canon_5d3, grasshopper3
+from hsnoise.training.options import shape_of, training_arguments
 
 CAMERAS = {"canon_5d3": canon_5d3, "grasshopper3": grasshopper3}
 
@@ -21,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
         description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
         "the same noise. New here? Run: hsnoise demo",
     )
-    top.add_argument("--version", action="version", version=f"hsnoise {version('hsnoise')}")
+    top.add_argument("--version", action="version", version=_versions())
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _demo_arguments(commands)
     _inspect_arguments(commands)
@@ -29,9 +31,17 @@ def parser() -> argparse.ArgumentParser:
     _loop_arguments(commands)
     _sample_arguments(commands)
     _enhance_arguments(commands)
+    training_arguments(commands)
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return top
+
+
+def _versions() -> str:
+    """What a report of an error should name."""
+    libraries = {"jax": "JAX", "numpy": "NumPy", "equinox": "Equinox", "optimistix": "Optimistix"}
+    found = [f"Python {platform.python_version()}", *(f"{name} {version(key)}" for key, name in libraries.items())]
+    return f"hsnoise {version('hsnoise')} ({', '.join(found)})"
 
 
 def _demo_arguments(commands: Any) -> None:
@@ -181,7 +191,7 @@ def _sample_arguments(commands: Any) -> None:
     sample.add_argument(
         "--exposure", type=_numbers, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
     )
-    sample.add_argument("--shape", type=_shape, metavar="ROWSxCOLUMNS", help="of dark frames (default 480x640)")
+    sample.add_argument("--shape", type=shape_of, metavar="ROWSxCOLUMNS", help="of dark frames (default 480x640)")
     sample.add_argument(
         "--clean",
         metavar="IMAGE",
@@ -195,15 +205,20 @@ def _sample_arguments(commands: Any) -> None:
 
 def _enhance_arguments(commands: Any) -> None:
     text = (
-        "Enhance a noisy video with a network that `python -m benchmarks.train` trained: of display values (a video "
-        "file or a folder of images), or with --camera of raw frames. Their noise should be as strong as that which "
-        "the network was trained on: an ordinary video has far less, and comes out worse. The first eight frames or "
-        "so come out poorer than those after them."
+        "Enhance a noisy video with the network that comes with hsnoise, or one that `hsnoise train` trained: of "
+        "display values (a video file or a folder of images), or with --camera of raw frames. Their noise should be as "
+        "strong as that which the network was trained on: an ordinary video has far less, and comes out worse. The "
+        "first eight frames or so come out poorer than those after them."
     )
     enhance = commands.add_parser("enhance", help="take the noise out of a video", description=text)
     enhance.add_argument("video", metavar="IN", help="a video file, a folder of images, or raw frames with --camera")
     enhance.add_argument("out", type=Path, metavar="OUT", help="video file to write: .mp4, .mkv, ...")
-    enhance.add_argument("--weights", type=Path, required=True, metavar="FILE", help="weights.eqx of a training run")
+    enhance.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="weights.eqx of a training run (default: those of hsnoise, for a Canon 5D Mark III at ISO 25600)",
+    )
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
     enhance.add_argument(
         "--exposure", type=_numbers, metavar="S", help="of raw frames, in seconds (default: what their files say)"
@@ -250,13 +265,6 @@ def _positive(text: str) -> int:
     if not (text.isdigit() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
     return int(text)
-
-
-def _shape(text: str) -> tuple[int, int]:
-    words = text.lower().split("x")
-    if len(words) != 2:
-        raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS such as 480x640, got {text!r}")
-    return _positive(words[0]), _positive(words[1])
 
 
 def _overscan(text: str) -> str | tuple[Any, Any]:

@@ -100,11 +100,11 @@ class NoiseBudget:
         )
 
     def to_pandas(self) -> Any:
-        """`table` as a pandas DataFrame (needs pandas: pip install hsnoise[pandas])."""
+        """`table` as a pandas DataFrame (needs pandas: pip install 'hsnoise[pandas]')."""
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("NoiseBudget.to_pandas: needs pandas; pip install hsnoise[pandas]") from error
+            raise ImportError("NoiseBudget.to_pandas: needs pandas: pip install 'hsnoise[pandas]'") from error
         return pandas.DataFrame(self.table, columns=TableRow._fields)
 
     def under(self, model: NoiseModel) -> NoiseBudget:

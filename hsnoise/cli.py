@@ -1,4 +1,4 @@
-"""The command line: `hsnoise demo`, `inspect`, `fit`, `compare`, `diagnose`, `improve`, `sample` and `enhance`."""
+"""The command line: `hsnoise demo`, `inspect`, `fit`, `compare`, `diagnose`, `improve`, `sample` and the others."""
 
 from __future__ import annotations
 
@@ -310,6 +310,18 @@ def _write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: b
     return ["model.json", "table.csv", *(f"{name}.png" for name in drawings)]
 
 
+def _train(args: argparse.Namespace) -> None:
+    from hsnoise.training.train import run  # optax and matplotlib are slow to import
+
+    run(args, Console(highlight=False, soft_wrap=True))
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from hsnoise.training.evaluate import run
+
+    run(args)
+
+
 RUN = {
     "demo": _demo,
     "inspect": _inspect,
@@ -319,4 +331,6 @@ RUN = {
     "improve": _improve,
     "sample": _sample.run,
     "enhance": lambda args: _enhance.run(args, args.camera and model_of(args.camera, "--camera")),
+    "train": _train,
+    "evaluate": _evaluate,
 }

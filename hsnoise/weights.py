@@ -21,6 +21,7 @@ from hsnoise._output import write_atomically
 from hsnoise.stlstm import STLSTM
 
 FORMAT = "hsnoise arrays 2"
+SHIPPED = Path(__file__).parent / "data" / "enhancer_canon_5d3.eqx"  # what it is: the .txt beside it
 
 
 def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:

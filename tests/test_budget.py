@@ -266,7 +266,7 @@ def test_table_goes_to_pandas_or_says_what_is_missing(monkeypatch):
         return real(name, *args, **keywords)
 
     monkeypatch.setattr(builtins, "__import__", without_pandas)
-    with pytest.raises(ImportError, match=r"pip install hsnoise\[pandas\]"):
+    with pytest.raises(ImportError, match=r"pip install 'hsnoise\[pandas\]'"):
         found.to_pandas()
 
 

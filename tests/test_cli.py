@@ -17,7 +17,7 @@ from hsnoise._loading import load_capture
 from hsnoise.cli import main
 from hsnoise.criticism import Comparison, Step, Story
 
-COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample")
+COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample", "train", "evaluate")
 
 
 @pytest.fixture(scope="module")

@@ -61,6 +61,12 @@ def test_a_video_is_enhanced(place, capsys, channels, more):
     assert np.stack(list(frames_of(out))).shape == FRAMES.shape
 
 
+def test_without_weights_those_that_come_with_hsnoise_are_taken(place, capsys):
+    assert main(["enhance", str(place / "clip.npz"), str(place / "shipped.mp4")]) == 0
+    assert "Weights that come with hsnoise, trained for canon_5d3, white of 1.6 to 6.2" in capsys.readouterr().err
+    assert np.stack(list(frames_of(place / "shipped.mp4"))).shape == FRAMES.shape
+
+
 def test_raw_frames_keep_their_own_exposure_and_colours(place, seen):
     """A model is fitted to darks of other exposures, and perhaps to a region with another first pixel."""
     model = hsnoise.cameras.canon_5d3(black_level_dn=64).with_value("dark_current", "rate", 100.0)

@@ -18,7 +18,8 @@ ORDER = """_types _keys _threads _compiling _memory _numerics _poisson _coloured
     cameras photometry _counting flat_pairs flats flat_gain narrow_noise statistics structure draws decomposition
     pixels rows flat_likelihood physics moments plan likelihood coordinates maximise profile result flat_notes
     notes lut line_spectrum line knobs synthetic pixel_fit pixel_result doubts fit plots _budget_table budget
-    criticism inspection report _options _table _progress _enhance _loading _sample cli __main__""".split()
+    criticism inspection report _sheet training _options _table _progress _enhance _loading _sample cli
+    __main__""".split()
 IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames", "_joining"}
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"]
 
@@ -77,5 +78,8 @@ assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
 heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2"} & set(sys.modules)
 assert not heavy, heavy
 assert set(hsnoise.__all__) <= set(dir(hsnoise))
+import hsnoise.cli
+heavy = {"matplotlib", "optax", "skimage", "av"} & set(sys.modules)
+assert not heavy, heavy
 """
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -10,17 +10,21 @@ import numpy as np
 import pytest
 
 import hsnoise
-from benchmarks import _checkpoints, evaluate, noise_ablation, train
-from benchmarks._clips import Clip, crops, held_out, read_clips
-from benchmarks._noisy import Camera, camera_of
-from benchmarks._rivals import denoised, rivals, tuned
-from benchmarks._training import Recipe, Trainer, batch_rng
+from benchmarks import noise_ablation
+from benchmarks.evaluate import main as run_evaluate
+from benchmarks.train import main as run_train
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.mosaic import electrons_of
 from hsnoise.photometry import display_from_linear
+from hsnoise.training import checkpoints, evaluate, train
+from hsnoise.training.clips import Clip, crops, held_out, read_clips
+from hsnoise.training.noisy import Camera, camera_of
+from hsnoise.training.presets import Preset, Recipe
+from hsnoise.training.rivals import denoised, rivals, tuned
+from hsnoise.training.steps import Trainer, batch_rng
 from hsnoise.weights import load_network, save_network
 
-TINY = train.Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
+TINY = Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
 
 
 @pytest.fixture
@@ -44,7 +48,7 @@ def leaves(path):
 
 
 def test_an_interrupted_run_ends_with_the_same_weights(folder, tmp_path, monkeypatch):
-    train.main(arguments(folder, tmp_path / "whole"))
+    run_train(arguments(folder, tmp_path / "whole"))
     step, monkeypatch_s = Trainer.step, 0.0
     monkeypatch.setattr(train, "CHECKPOINT_S", monkeypatch_s)
 
@@ -55,39 +59,39 @@ def test_an_interrupted_run_ends_with_the_same_weights(folder, tmp_path, monkeyp
 
     monkeypatch.setattr(Trainer, "step", killed)
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, tmp_path / "cut"))
+        run_train(arguments(folder, tmp_path / "cut"))
     monkeypatch.setattr(Trainer, "step", step)
     # The newest checkpoint is cut off in the middle: the one before is taken.
-    newest = _checkpoints.checkpoints(tmp_path / "cut")[0]
+    newest = checkpoints.checkpoints(tmp_path / "cut")[0]
     newest.write_bytes(newest.read_bytes()[:-100])
-    train.main(arguments(folder, tmp_path / "cut"))
+    run_train(arguments(folder, tmp_path / "cut"))
     for one, other in zip(
         leaves(tmp_path / "whole" / train.ENDED), leaves(tmp_path / "cut" / train.ENDED), strict=True
     ):
         np.testing.assert_array_equal(one, other)
     logs = [(tmp_path / run / "log.csv").read_text() for run in ("whole", "cut")]
     assert logs[0] == logs[1] and logs[0].count("\n") == 3
-    assert len(_checkpoints.checkpoints(tmp_path / "cut")) == 2
+    assert len(checkpoints.checkpoints(tmp_path / "cut")) == 2
     assert (tmp_path / "cut" / "validation-00000006.png").stat().st_size > 100
 
 
 def test_a_full_disk_is_told_and_the_last_checkpoint_stays(folder, tmp_path, monkeypatch, capsys):
-    train.main(arguments(folder, tmp_path / "run"))
-    kept = [path.read_bytes() for path in _checkpoints.checkpoints(tmp_path / "run")]
+    run_train(arguments(folder, tmp_path / "run"))
+    kept = [path.read_bytes() for path in checkpoints.checkpoints(tmp_path / "run")]
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("benchmarks._checkpoints.write_arrays", full)
+    monkeypatch.setattr("hsnoise.training.checkpoints.write_arrays", full)
     with pytest.raises(OSError, match="the last one is intact"):
-        _checkpoints.write(tmp_path / "run", 7, {}, {})
-    assert [path.read_bytes() for path in _checkpoints.checkpoints(tmp_path / "run")] == kept
+        checkpoints.write(tmp_path / "run", 7, {}, {})
+    assert [path.read_bytes() for path in checkpoints.checkpoints(tmp_path / "run")] == kept
 
 
 def test_another_run_in_the_same_folder_is_refused(folder, tmp_path, capsys):
-    train.main(arguments(folder, tmp_path / "run"))
+    run_train(arguments(folder, tmp_path / "run"))
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, tmp_path / "run", "--seed", "1"))
+        run_train(arguments(folder, tmp_path / "run", "--seed", "1"))
     assert "another run (seed differ" in capsys.readouterr().err
     assert json.loads((tmp_path / "run" / "run.json").read_text())["seed"] == 0
 
@@ -98,9 +102,9 @@ def test_another_model_of_the_same_name_is_another_run(folder, tmp_path, capsys)
         hsnoise.cameras.canon_5d3(black_level_dn=black_level_dn).save(path)
         run = arguments(folder, tmp_path / "run", "--camera", str(path), "--white-e", "2,10")
         if black_level_dn == 0:
-            train.main(run)
+            run_train(run)
     with pytest.raises(SystemExit):
-        train.main(run)
+        run_train(run)
     assert "another run (digests differ" in capsys.readouterr().err
 
 
@@ -117,20 +121,20 @@ def interrupted(monkeypatch, number):
 
 
 def test_an_interrupt_keeps_the_steps_until_then(folder, tmp_path, monkeypatch, capsys):
-    train.main(arguments(folder, tmp_path / "whole"))
+    run_train(arguments(folder, tmp_path / "whole"))
     with monkeypatch.context() as patched:
         interrupted(patched, 4)
         with pytest.raises(SystemExit):
-            train.main(arguments(folder, tmp_path / "run"))
-    assert [path.name for path in _checkpoints.checkpoints(tmp_path / "run")] == ["checkpoint-00000004.eqx"]
-    capsys.readouterr()
-    train.main(arguments(folder, tmp_path / "run"))
+            run_train(arguments(folder, tmp_path / "run"))
+    assert [path.name for path in checkpoints.checkpoints(tmp_path / "run")] == ["checkpoint-00000004.eqx"]
+    assert "the same command goes on where it stopped" in capsys.readouterr().out
+    run_train(arguments(folder, tmp_path / "run"))
     assert "Going on from step 4" in capsys.readouterr().out
     for one, other in zip(
         leaves(tmp_path / "whole" / train.ENDED), leaves(tmp_path / "run" / train.ENDED), strict=True
     ):
         np.testing.assert_array_equal(one, other)
-    train.main(arguments(folder, tmp_path / "run"))
+    run_train(arguments(folder, tmp_path / "run"))
     assert "Already finished" in capsys.readouterr().out
 
 
@@ -138,14 +142,14 @@ def test_checkpoints_of_another_run_are_told_without_its_description(folder, tmp
     run = tmp_path / "run"
     interrupted(monkeypatch, 4)
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, run))
+        run_train(arguments(folder, run))
     (run / train.DESCRIBED).write_text('{"preset": ')
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, run))
+        run_train(arguments(folder, run))
     assert "run.json: damaged" in capsys.readouterr().err
     (run / train.DESCRIBED).unlink()
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, run, "--seed", "7"))
+        run_train(arguments(folder, run, "--seed", "7"))
     assert "another run (seed differ" in capsys.readouterr().err
 
 
@@ -166,36 +170,36 @@ def test_a_loss_that_is_no_number_ends_the_run(folder, tmp_path, monkeypatch, ca
     step = Trainer.step
     monkeypatch.setattr(Trainer, "step", lambda self, *args: (step(self, *args)[0], jnp.float32(np.nan)))
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, tmp_path / "run"))
+        run_train(arguments(folder, tmp_path / "run"))
     assert "the loss is nan" in capsys.readouterr().err
-    assert not (tmp_path / "run" / train.ENDED).exists() and not _checkpoints.checkpoints(tmp_path / "run")
+    assert not (tmp_path / "run" / train.ENDED).exists() and not checkpoints.checkpoints(tmp_path / "run")
 
 
 def test_a_first_checkpoint_that_was_cut_off_begins_anew(tmp_path):
     tree, said = {"weight": jnp.arange(3.0)}, []
-    path = _checkpoints.write(tmp_path, 100, tree, {})
+    path = checkpoints.write(tmp_path, 100, tree, {})
     path.write_bytes(path.read_bytes()[:-4])
-    assert _checkpoints.read_newest(tmp_path, tree, said.append) is None
-    assert "none before it" in said[0] and not _checkpoints.checkpoints(tmp_path)
+    assert checkpoints.read_newest(tmp_path, tree, said.append) is None
+    assert "none before it" in said[0] and not checkpoints.checkpoints(tmp_path)
     for step in (200, 300):
-        path = _checkpoints.write(tmp_path, step, tree, {})
+        path = checkpoints.write(tmp_path, step, tree, {})
         path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(ValueError, match="none of its 2 checkpoints"):
-        _checkpoints.read_newest(tmp_path, tree, said.append)
+        checkpoints.read_newest(tmp_path, tree, said.append)
 
 
 def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
     tree = {"weight": jnp.arange(3.0)}
     for step in (100, 200):
-        _checkpoints.write(tmp_path, step, tree, {})
-    cut = _checkpoints.checkpoints(tmp_path)[0]
+        checkpoints.write(tmp_path, step, tree, {})
+    cut = checkpoints.checkpoints(tmp_path)[0]
     cut.write_bytes(cut.read_bytes()[:-4])
     said = []
-    assert _checkpoints.read_newest(tmp_path, tree, said.append)[1]["step"] == 100
+    assert checkpoints.read_newest(tmp_path, tree, said.append)[1]["step"] == 100
     assert "taking the one before" in said[0]
     for step in (150, 160):
-        _checkpoints.write(tmp_path, step, tree, {})
-    assert [path.name[11:19] for path in _checkpoints.checkpoints(tmp_path)] == ["00000160", "00000150"]
+        checkpoints.write(tmp_path, step, tree, {})
+    assert [path.name[11:19] for path in checkpoints.checkpoints(tmp_path)] == ["00000160", "00000150"]
 
 
 @pytest.mark.parametrize(
@@ -209,6 +213,7 @@ def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
         (["--white-e", "1,inf"], "--white-e: expected low,high"),
         (["--white-e", "4,3"], "--white-e: expected low,high"),
         (["--exposure", "0.1"], "--exposure: goes with a model.json"),
+        (["--steps", "0"], "--steps: expected at least 1"),
         (["--seed", "-1"], "--seed: expected 0 to"),
         (["--seed", str(2**70)], "--seed: expected 0 to"),
         (["--clips", "nowhere"], "--clips: expected a folder"),
@@ -218,7 +223,7 @@ def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
 )
 def test_bad_input_is_named(folder, tmp_path, capsys, more, words):
     with pytest.raises(SystemExit):
-        train.main(arguments(folder, tmp_path / "run", *more))
+        run_train(arguments(folder, tmp_path / "run", *more))
     assert words in capsys.readouterr().err
 
 
@@ -235,6 +240,13 @@ def test_the_same_step_is_the_same_whatever_came_before(folder):
         np.testing.assert_array_equal(a, b)
 
 
+def test_rivals_that_are_not_installed_are_named_with_their_extra(monkeypatch, capsys):
+    monkeypatch.setattr("hsnoise.training.rivals.find_spec", lambda name: None)
+    monkeypatch.setattr(evaluate, "rivals", dict)  # the others take minutes
+    evaluate.methods_of(None, None, untrained=True)
+    assert "BM3D and BM4D over frames are left out: pip install 'hsnoise[peers]'" in capsys.readouterr().out
+
+
 def test_rivals_make_noisy_frames_better():
     rng = np.random.default_rng(0)
     clean = np.asarray(display_from_linear(np.full((3, 32, 32, 3), 0.3)))
@@ -249,31 +261,29 @@ def test_rivals_make_noisy_frames_better():
 
 
 def test_an_evaluation_is_written(folder, tmp_path, capsys):
-    train.main(arguments(folder, tmp_path / "run"))
+    run_train(arguments(folder, tmp_path / "run"))
     weights = tmp_path / "run" / train.ENDED
-    evaluate.main(
-        [str(weights), "--clips", str(folder), "--crop", "8", "--no-rivals", "--out", str(tmp_path / "found")]
-    )
+    run_evaluate([str(weights), "--clips", str(folder), "--crop", "8", "--no-rivals", "--out", str(tmp_path / "found")])
     text = (tmp_path / "found" / "evaluation.md").read_text()
     assert "scaled input" in text and "hsnoise ST-LSTM" in text and "| d |" in text
     assert "canon_5d3, 0.05 lux to 0.2 lux" in text
     assert len((tmp_path / "found" / "frames.csv").read_text().splitlines()) == 1 + 2 * 3 * 4  # methods, levels, frames
     assert (tmp_path / "found" / "curves.png").exists() and (tmp_path / "found" / "frames-d.png").exists()
     with pytest.raises(SystemExit):
-        evaluate.main([str(weights.with_name("run.json")), "--clips", str(folder)])
+        run_evaluate([str(weights.with_name("run.json")), "--clips", str(folder)])
     assert "not a file of weights" in capsys.readouterr().err
 
 
 def test_clips_that_were_trained_on_are_not_scored(folder, tmp_path, capsys):
-    train.main(arguments(folder, tmp_path / "run"))
+    run_train(arguments(folder, tmp_path / "run"))
     net, about = load_network(tmp_path / "run" / train.ENDED)
     save_network(tmp_path / "other.eqx", net, {**about, "clips": [*about["clips"], *about["held_out"]]})
     with pytest.raises(SystemExit):
-        evaluate.main([str(tmp_path / "other.eqx"), "--clips", str(folder), "--crop", "8", "--no-rivals"])
+        run_evaluate([str(tmp_path / "other.eqx"), "--clips", str(folder), "--crop", "8", "--no-rivals"])
     assert "was trained on them" in capsys.readouterr().err
     (folder / "a.npz").rename(folder / "d2.npz")  # the fourth by name now
     with pytest.raises(SystemExit):
-        evaluate.main([str(tmp_path / "run" / train.ENDED), "--clips", str(folder), "--crop", "8", "--no-rivals"])
+        run_evaluate([str(tmp_path / "run" / train.ENDED), "--clips", str(folder), "--crop", "8", "--no-rivals"])
     assert "d2 would be scored" in capsys.readouterr().err
 
 
@@ -282,16 +292,16 @@ def test_weights_are_judged_with_the_camera_and_light_of_their_training(folder, 
     other.parent.mkdir()
     hsnoise.cameras.canon_5d3(black_level_dn=64).save(model)
     hsnoise.cameras.canon_5d3(black_level_dn=128).save(other)
-    train.main(arguments(folder, tmp_path / "run", "--camera", str(model), "--white-e", "2,10"))
+    run_train(arguments(folder, tmp_path / "run", "--camera", str(model), "--white-e", "2,10"))
     judge = [str(tmp_path / "run" / train.ENDED), "--clips", str(folder), "--crop", "8", "--no-rivals"]
     judge += ["--out", str(tmp_path / "found")]
     with pytest.raises(SystemExit):
-        evaluate.main(judge)
+        run_evaluate(judge)
     assert "--camera: the weights were trained for model" in capsys.readouterr().err
-    evaluate.main([*judge, "--camera", str(model)])
+    run_evaluate([*judge, "--camera", str(model)])
     assert "another camera" not in capsys.readouterr().out
     assert "2 e- to 10 e-" in (tmp_path / "found" / "evaluation.md").read_text()
-    evaluate.main([*judge, "--camera", str(other)])
+    run_evaluate([*judge, "--camera", str(other)])
     assert "another camera" in capsys.readouterr().out
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -9,14 +12,14 @@ from PIL import Image
 from scipy import ndimage
 
 import hsnoise
-from benchmarks import evaluate
-from benchmarks._clips import Clip, crops, held_out, moving_stills, read_clips
-from benchmarks._noisy import OPTICS, camera_of, jittered, matched, noise_of
-from benchmarks._training import batch_rng, examples
-from benchmarks._validation import Validation
-from benchmarks._vgg import LAYERS, features_of, name_of, read_weights
 from hsnoise._types import cfa_tile
 from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise, TapOffsets
+from hsnoise.training import evaluate
+from hsnoise.training.clips import Clip, crops, held_out, moving_stills, read_clips
+from hsnoise.training.noisy import OPTICS, camera_of, jittered, matched, noise_of
+from hsnoise.training.steps import batch_rng, examples
+from hsnoise.training.validation import Validation
+from hsnoise.training.vgg import LAYERS, features_of, name_of, read_weights
 
 
 def test_a_short_clip_is_played_forth_and_back():
@@ -213,6 +216,18 @@ def by_scipy(state, frames):
                     y[n, :, :, o] += ndimage.correlate(x[n, :, :, c], weight[o, c], mode="constant")
         x = np.maximum(y + bias, 0)
     return x
+
+
+@pytest.mark.parametrize(
+    ("suffix", "package", "words"),
+    [("safetensors", "safetensors.numpy", "hsnoise[vgg]"), ("pth", "torch", "pip install torch")],
+)
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch, suffix, package, words):
+    path = tmp_path / f"vgg.{suffix}"
+    path.write_bytes(b"weights")
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=re.escape(words)):
+        read_weights(path)
 
 
 def test_other_weights_are_refused(tmp_path):

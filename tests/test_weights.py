@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
 from hsnoise.stlstm import STLSTM
-from hsnoise.weights import load_network, read_arrays, save_network, write_arrays
+from hsnoise.weights import SHIPPED, load_network, read_arrays, save_network, write_arrays
 
 NET = STLSTM(jax.random.key(0), maps=2, kernels=(3, 5), stride=2, channels=1)
 
@@ -98,6 +96,6 @@ def test_weights_that_are_not_finite_are_told(tmp_path):
         load_network(path)
 
 
-def test_the_weights_of_the_repository_are_read():
-    net, about = load_network(Path(__file__).parents[1] / "benchmarks" / "weights" / "canon_5d3.eqx")
+def test_the_weights_that_come_with_hsnoise_are_read():
+    net, about = load_network(SHIPPED)
     assert net.channels == 3 and about["camera"] == "canon_5d3"

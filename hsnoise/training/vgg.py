@@ -53,14 +53,18 @@ def read_weights(path: Path) -> tuple[dict[str, np.ndarray], str]:
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
-    from safetensors.numpy import load_file
-
+    try:
+        from safetensors.numpy import load_file
+    except ImportError as error:
+        raise ImportError(f"--vgg: {path} needs safetensors: pip install 'hsnoise[vgg]'") from error
     return load_file(path)
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    import torch
-
+    try:
+        import torch
+    except ImportError as error:
+        raise ImportError(f"--vgg: {path} needs PyTorch: pip install torch; a .safetensors file does not") from error
     state = torch.load(path, map_location="cpu", weights_only=True)
     return {name: value.detach().float().numpy() for name, value in state.items() if str(name).startswith("features.")}
 

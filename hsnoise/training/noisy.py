@@ -8,15 +8,16 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-import hsnoise
-from hsnoise import NoiseModel, photoelectrons_from_illuminance
+from hsnoise import cameras
 from hsnoise._keys import named_key
 from hsnoise._types import cfa_tile
 from hsnoise.draws import black_level_of
 from hsnoise.effects import BlackLevel, DarkCurrent, ReadNoise, ShotNoise
+from hsnoise.model import NoiseModel, sample
 from hsnoise.mosaic import electrons_of, mosaic
-from hsnoise.photometry import GREY
+from hsnoise.photometry import GREY, photoelectrons_from_illuminance
 
 JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
@@ -35,7 +36,7 @@ class Optics:
     quantum_efficiency: float
     lux: tuple[float, float]
 
-    def white_e(self, lux) -> jax.Array:
+    def white_e(self, lux) -> ArrayLike:
         """Photoelectrons of a pixel that sees a white surface in `lux`: the lens passes 1 / (4 N^2) of them."""
         return photoelectrons_from_illuminance(
             lux / (4 * self.f_number**2),
@@ -105,7 +106,7 @@ def camera_of(
 
 
 def _built_in(name: str, lux: tuple[float, float] | None, white_e: tuple[float, float] | None) -> Camera:
-    model, optics = getattr(hsnoise.cameras, name)(), OPTICS[name]
+    model, optics = getattr(cameras, name)(), OPTICS[name]
     if white_e is None:
         low, high = checked_light("--lux", lux or optics.lux)
         white_e = float(optics.white_e(low)), float(optics.white_e(high))
@@ -172,7 +173,7 @@ def _variance_e2(model: NoiseModel, light_e: float) -> float:
     light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
     # Before clipping: the simpler noise is clipped, too.
     open_ended = model.remove("adc") if "adc" in model else model
-    counts = np.asarray(hsnoise.sample(jax.random.key(0), light, open_ended), np.float64)
+    counts = np.asarray(sample(jax.random.key(0), light, open_ended), np.float64)
     tile = cfa_tile(model.cfa)
     gain = np.tile(np.asarray(model["gain"].value)[tile], [n // len(tile) for n in MATCH_SHAPE])
     return float(0.5 * np.mean((np.diff(counts, axis=0) / gain) ** 2))
@@ -201,7 +202,7 @@ def noisy_of(
     """
     photons = mosaic(light * white_e, noise.cfa)
     window = None if sensor is None else _somewhere(named_key(key, "place"), photons.shape, sensor, noise.cfa)
-    return electrons_of(hsnoise.sample(key, photons, noise, window=window), camera) / white_e
+    return electrons_of(sample(key, photons, noise, window=window), camera) / white_e
 
 
 def _somewhere(key: jax.Array, shape: tuple[int, ...], sensor: Shape, cfa: str) -> tuple:

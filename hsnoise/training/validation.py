@@ -10,11 +10,11 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks._clips import Clip
-from benchmarks._noisy import Camera, noisy_of
 from hsnoise._output import write_figure
 from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.stlstm import STLSTM
+from hsnoise.training.clips import Clip
+from hsnoise.training.noisy import Camera, noisy_of
 
 CROP = 96
 MOST_CLIPS = 4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,23 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks._noisy import JITTER, Camera, Shape, jittered, noisy_of
-from hsnoise import NoiseModel
 from hsnoise._keys import named_key
+from hsnoise.model import NoiseModel
 from hsnoise.photometry import display_from_linear, light_of_frames
 from hsnoise.stlstm import STLSTM, loss
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """Network and optimiser. decay: the rate falls to 0 by a cosine, as short runs need; else it stays."""
-
-    maps: int = 64
-    kernels: tuple[int, ...] = (3, 5, 5, 3)
-    stride: int = 2
-    rate: float = 1e-3
-    decay: bool = True
-    checkpoint: bool = False
+from hsnoise.training.noisy import JITTER, Camera, Shape, jittered, noisy_of
+from hsnoise.training.presets import Recipe
 
 
 def batch_rng(seed: int, step: int) -> np.random.Generator:

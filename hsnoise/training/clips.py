@@ -115,7 +115,7 @@ def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: i
     """
     out = np.empty((batch, frames, side, side, 3), np.uint8)
     for i in range(batch):
-        video = clips[rng.integers(len(clips))].frames
+        video = clips[int(rng.integers(len(clips)))].frames
         row, column = (rng.integers(n - side + 1) for n in video.shape[1:3])
         piece = video[_places(len(video), frames, rng), row : row + side, column : column + side]
         if rng.integers(2):

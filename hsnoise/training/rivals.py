@@ -47,17 +47,24 @@ def _bm4d(frames: np.ndarray, sigma: float) -> np.ndarray:
     return np.moveaxis(np.stack(planes, -1), 2, 0)
 
 
+PEERS: dict[str, tuple[str, Denoiser]] = {
+    "BM3D": ("bm3d", partial(_frame_by_frame, _bm3d)),
+    "BM4D over frames": ("bm4d", _bm4d),
+}
+
+
 def rivals() -> dict[str, Denoiser]:
     """By name; BM3D and BM4D if their packages (extra `peers`) are installed."""
     found: dict[str, Denoiser] = {
         "non-local means": partial(_frame_by_frame, _non_local_means),
         "total variation": partial(_frame_by_frame, _total_variation),
     }
-    if find_spec("bm3d"):
-        found["BM3D"] = partial(_frame_by_frame, _bm3d)
-    if find_spec("bm4d"):
-        found["BM4D over frames"] = _bm4d
-    return found
+    return found | {name: denoise for name, (package, denoise) in PEERS.items() if find_spec(package)}
+
+
+def not_installed() -> list[str]:
+    """Names of the rivals whose packages are missing."""
+    return [name for name, (package, _) in PEERS.items() if not find_spec(package)]
 
 
 def denoised(denoise: Denoiser, noisy: np.ndarray, sigma: float, strength: float, linear: bool) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Training and judging the video enhancer: the commands `hsnoise train` and `hsnoise evaluate`."""

@@ -1,0 +1,133 @@
+"""The wheel: what is in it, and that it works where nothing else of the project is."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+import venv
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MOST_BYTES = 10_000_000
+
+
+def run(*words: str | Path, cwd: Path) -> str:
+    """What a command prints, run outside of the checkout; fails with what it says if it does not end well."""
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run([*map(str, words)], cwd=cwd, env=clean, capture_output=True, text=True)
+    assert done.returncode == 0, f"{' '.join(map(str, words))}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def registry(tmp_path_factory) -> None:
+    """Skips where pip finds no packages."""
+    pytest.importorskip("pip")
+    folder = tmp_path_factory.mktemp("registry")
+    found = subprocess.run(
+        [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--retries", "0", "-d", str(folder), "hatchling"],
+        capture_output=True,
+        text=True,
+    )
+    if found.returncode:
+        pytest.skip(f"no package registry: {found.stderr.strip().splitlines()[-1]}")
+
+
+@pytest.fixture(scope="module")
+def wheel(registry, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, cwd=folder)
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """The folder of the commands of an environment that holds the wheel and what it requires, nothing else."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=True)
+    commands = folder / ("Scripts" if os.name == "nt" else "bin")
+    run(commands / "python", "-m", "pip", "install", "-q", wheel, cwd=folder)
+    return commands
+
+
+def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as file:
+        names = set(file.namelist())
+    package = {path.relative_to(ROOT).as_posix() for path in (ROOT / "hsnoise").rglob("*") if path.is_file()}
+    package = {name for name in package if "__pycache__" not in name}
+    assert {"hsnoise/py.typed", "hsnoise/data/enhancer_canon_5d3.eqx"} <= package
+    about = f"hsnoise-{PROJECT['version']}.dist-info/"
+    assert {name for name in names if not name.startswith(about)} == package
+    assert f"{about}licenses/LICENSE" in names
+    assert wheel.stat().st_size < MOST_BYTES
+
+
+def test_the_wheel_says_what_it_is(wheel):
+    with zipfile.ZipFile(wheel) as file:
+        about = f"hsnoise-{PROJECT['version']}.dist-info"
+        metadata = Parser().parsestr(file.read(f"{about}/METADATA").decode())
+        assert "hsnoise = hsnoise.cli:main" in file.read(f"{about}/entry_points.txt").decode()
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert not [one for one in metadata.get_all("Classifier") if one.startswith("License")]  # the expression says it
+    assert "Typing :: Typed" in metadata.get_all("Classifier")
+    assert set(metadata.get_all("Provides-Extra")) == set(PROJECT["optional-dependencies"])
+
+
+def test_the_citation_names_this_version():
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.slow
+def test_the_installed_package_works_outside_of_the_checkout(installed, tmp_path):
+    command = installed / "hsnoise"
+    assert f"hsnoise {PROJECT['version']} (Python 3." in run(command, "--version", cwd=tmp_path)
+    exposures = ("--exposure", "0.05,0.2,0.8")
+    run(command, "sample", "canon_5d3", *exposures, "--shape", "64x96", "--out", "darks.npz", cwd=tmp_path)
+    assert np.load(tmp_path / "darks.npz")["counts"].shape == (3, 8, 64, 96)
+    assert "dark_current.rate" in run(command, "fit", "darks.npz", "--out", "fit", cwd=tmp_path)
+    assert {"model.json", "table.csv"} <= {path.name for path in (tmp_path / "fit").iterdir()}
+    code = """
+from pathlib import Path
+import hsnoise
+from hsnoise.weights import SHIPPED, load_network
+folder = Path(hsnoise.__file__).parent
+assert (folder / "py.typed").exists() and load_network(SHIPPED)
+print(folder, hsnoise.__version__)
+"""
+    folder, version = run(installed / "python", "-c", code, cwd=tmp_path).split()
+    assert Path(folder).is_relative_to(installed.parent) and version == PROJECT["version"]
+
+
+@pytest.mark.slow
+def test_what_belongs_to_an_extra_names_it(installed, tmp_path):
+    np.savez(tmp_path / "clip.npz", frames=np.zeros((2, 16, 16, 3), np.uint8))
+    words = [str(installed / "hsnoise"), "enhance", "clip.npz", "out.mp4"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and "pip install 'hsnoise[video]'" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
+def test_every_extra_can_be_installed(installed, wheel, tmp_path, extra):
+    run(installed / "python", "-m", "pip", "install", "-q", "--dry-run", f"{wheel}[{extra}]", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_source_distribution_gives_the_same_wheel(installed, wheel, tmp_path):
+    python = installed / "python"
+    run(python, "-m", "pip", "install", "-q", "hatchling", cwd=tmp_path)
+    run(python, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path, cwd=ROOT)
+    (source,) = tmp_path.glob("*.tar.gz")
+    run(python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, source, cwd=tmp_path)
+    (again,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(again) as other:
+        assert {i.filename: i.CRC for i in one.infolist()} == {i.filename: i.CRC for i in other.infolist()}
