@@ -10,11 +10,12 @@ import numpy as np
 
 from hsnoise._arguments import callback
 from hsnoise._budget_table import printed
-from hsnoise.decomposition import COMPONENTS, Component
+from hsnoise.decomposition import COMPONENTS, Component, mean_of
 from hsnoise.draws import check_fits, draw_capture, middle_of
 from hsnoise.model import NoiseModel
 from hsnoise.pixels.classes import levels_of, slope_over
 from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
+from hsnoise.pixels.sample import covariance_of
 from hsnoise.pixels.survey import Group, Survey, survey
 from hsnoise.stack import FrameStack, as_stack
 
@@ -176,7 +177,7 @@ def budget_of(found: Survey, stack: FrameStack) -> NoiseBudget:
 
 def _row(found: Survey, group: Group, channel: int) -> BudgetRow:
     planes = group.of(channel)
-    components = {name: _mean([p.components[name] for p in planes]) for name in COMPONENTS}
+    components = {name: mean_of([p.components[name] for p in planes]) for name in COMPONENTS}
     return BudgetRow(
         exposure_s=group.exposure_s,
         kind=group.kind,
@@ -187,13 +188,6 @@ def _row(found: Survey, group: Group, channel: int) -> BudgetRow:
         saturated_share=float(group.saturated_share[channel]),
         components=components,
     )
-
-
-def _mean(parts: list[Component]) -> Component:
-    """The mean of a component over the planes of a colour."""
-    n = len(parts)
-    error = np.sqrt(sum(p.standard_error_dn2**2 for p in parts)) / n
-    return Component(sum(p.variance_dn2 for p in parts) / n, float(error), sum(p.share for p in parts) / n)
 
 
 def _growth(rows: tuple[BudgetRow, ...]) -> dict[tuple[str, str], tuple[float, float]]:
@@ -248,7 +242,7 @@ def _spread(values: np.ndarray, unit: str) -> PixelSpread:
     median = float(np.median(mean))
     width = 5 * 1.4826 * float(np.median(np.abs(mean - median))) + 1e-12
     a, b = np.clip(values.astype(np.float64), median - width, median + width)
-    covariance = float(((a - a.mean()) * (b - b.mean())).mean())
+    covariance = covariance_of(a, b)
     few = min(max(FEWEST_TOP, int(TOP_SHARE * len(mean))), len(mean))
     top = [np.median(values[1 - half][np.argpartition(values[half], -few)[-few:]]) for half in (0, 1)]
     return PixelSpread(median, float(np.sqrt(max(covariance, 0.0))), max(float(np.mean(top)) - median, 0.0), unit)

@@ -13,6 +13,7 @@ noise", SPIE 1488, 1991; expected mean squares: Searle, Casella, McCulloch, *Var
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,16 @@ class Component:
     standard_error_dn2: float
     share: float = float("nan")
     chance_dn2: float = float("nan")
+
+
+def mean_of(parts: Sequence[Component]) -> Component:
+    """The mean of one component over the planes of a colour; their errors are independent."""
+    n = len(parts)
+    error, chance = (
+        float(np.sqrt(sum(getattr(part, name) ** 2 for part in parts))) / n
+        for name in ("standard_error_dn2", "chance_dn2")
+    )
+    return Component(sum(p.variance_dn2 for p in parts) / n, error, sum(p.share for p in parts) / n, chance)
 
 
 class PlaneSums:

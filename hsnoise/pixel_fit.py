@@ -13,10 +13,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hsnoise.decomposition import mean_of
 from hsnoise.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.flats import FlatMoments
 from hsnoise.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.pixels.population import Population, offset_sigma, population_of
+from hsnoise.pixels.sample import without_outliers
 from hsnoise.pixels.shading import Shading, shading_of
 from hsnoise.pixels.structure import double_differences, low_side_sigma, plane_rows
 from hsnoise.pixels.survey import Plane, Survey
@@ -35,7 +37,6 @@ MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that
 ROW_GAIN_THERE = 3.0
 ROUNDS = 30
 UNKNOWN = 1e6  # relative error of what is not known
-OUTLYING = 6.0  # deviations of a pixel's temporal variance that is no noise of it
 
 
 @dataclass(frozen=True)
@@ -166,13 +167,9 @@ def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str
     if not planes:
         return out
     for component, effect in PATTERNS.items():
-        parts = [p.components[component] for p in planes]
-        error, chance = (
-            float(np.sqrt(sum(getattr(one, name) ** 2 for one in parts))) / len(parts)
-            for name in ("standard_error_dn2", "chance_dn2")
-        )
+        shared = mean_of([plane.components[component] for plane in planes])
         smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
-        out[effect] = float(np.mean([one.variance_dn2 for one in parts])) - smooth, error, chance
+        out[effect] = shared.variance_dn2 - smooth, shared.standard_error_dn2, shared.chance_dn2
     return out
 
 
@@ -197,8 +194,7 @@ def _temporal(found: Survey, c: int) -> tuple[float, float]:
     variance = variance[~found.stuck(c)]
     if not (variance > 0).any():
         return 0.0, UNKNOWN
-    typical = float(np.median(variance)) + 1e-6
-    kept = variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (group.n_frames - 1))) ** 2]
+    kept = without_outliers(variance, group.n_frames)
     return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
 
 

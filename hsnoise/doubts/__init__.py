@@ -66,7 +66,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
             "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
             f" lies between {low:.3g} and {high:.3g} DN/e-"
         )
-    elif len({g.exposure_s for g in found.repeated_darks}) < 2:
+    elif not found.has_exposures:
         why = "darks of one exposure show no growth of signal"
     else:
         why = "the dark signal of ordinary pixels does not grow with exposure by enough"
@@ -79,12 +79,10 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _named_noise(found: Survey) -> str:
     """What the noise without signal is: with one exposure, that exposure's own, dark shot noise included."""
-    shortest = min(g.exposure_s for g in found.repeated_darks)
-    return (
-        "Read noise"
-        if len({g.exposure_s for g in found.repeated_darks}) > 1 or shortest == 0
-        else f"The noise at {shortest:g} s, shot noise included,"
-    )
+    shortest_s = found.shortest.exposure_s if found.shortest is not None else 0.0
+    if found.has_exposures or shortest_s == 0:
+        return "Read noise"
+    return f"The noise at {shortest_s:g} s, shot noise included,"
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
@@ -146,7 +144,7 @@ def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
     if result.transfer is None or not result.has_gain:
         return
     for c, _ in enumerate(found.channels):
-        clipped = max((g.clipped_share[c] for g in found.darks if g.n_frames > 1), default=0.0)
+        clipped = max((group.clipped_share[c] for group in found.repeated_darks), default=0.0)
         if clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
             yield (
                 f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: what clipping takes"
@@ -202,8 +200,8 @@ def _of_flats(result: FitResult) -> list[str]:
 
 def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
     """What read noise is at most, where it is narrower than a count."""
-    darks = found.repeated_darks
-    bounds = [p.narrow_dn[1] for p in min(darks, key=lambda g: g.exposure_s).planes if p.narrow_dn] if darks else []
+    planes = found.shortest.planes if found.shortest is not None else ()
+    bounds = [plane.narrow_dn[1] for plane in planes if plane.narrow_dn]
     if not bounds or not np.isfinite(max(bounds)):
         return
     bound, gain = max(bounds), float(np.mean(np.asarray(result.physics.gain)))

@@ -25,7 +25,7 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
     found, summary = seen.survey, seen.summary
     if method == "line" or not can_be_transferred(found):
         return False
-    if not seen.has_exposures:  # flats tell it; a likelihood adds nothing, and rows and columns of real sensors bend it
+    if not found.has_exposures:  # flats tell it: a likelihood adds nothing, and rows of real sensors bend it
         return summary.flats is not None and has_patterns(found)
     fell = fall_of(found) is not None  # pedestals that jump so far pass for a signal
     if variance_grows(found) and not fell:
@@ -36,7 +36,7 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
 def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
     """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
     found, summary = seen.survey, seen.summary
-    if summary.flats is not None or not can_be_transferred(found) or not seen.has_exposures or full_of_hits(found):
+    if summary.flats is not None or not can_be_transferred(found) or not found.has_exposures or full_of_hits(found):
         return result
     pixel = seen.darks
     if not pixel.determined:

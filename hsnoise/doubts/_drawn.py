@@ -8,16 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import jax
 import numpy as np
 
+from hsnoise._keys import named_key
 from hsnoise._types import seconds
-from hsnoise.decomposition import Component
-from hsnoise.draws import draw_capture, middle_of
+from hsnoise.decomposition import Component, mean_of
+from hsnoise.model import NoiseModel, sample_by_effect
+from hsnoise.pixels.sample import without_outliers
 from hsnoise.pixels.survey import Group, Survey, survey
 from hsnoise.result import FitResult
+from hsnoise.stack import FrameStack
 
+FRAMES, SHAPE = 8, (128, 256)  # that are drawn of an exposure
 MOST_EXPOSURES = 4  # that are drawn: the shortest, the longest, and between
-OUTLYING = 6.0  # deviations of a pixel's temporal variance that is no noise of it
 NOISE_SHARE = 0.08  # of a noise, by which the two may differ
 LEVEL_NOISES, LEVEL_SHARE = 1.0, 0.1  # of a pixel's noise, and of the signal
 ROW_SHARE, ROW_NOISE = 0.5, 0.02  # of the larger one, and of the variance of a pixel
@@ -31,7 +35,7 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
     chosen = _chosen(found)
     if any(plane.narrow_dn is not None for i in chosen for plane in found.groups[i].planes):
         return  # rounding, which two noises below a count share unequally, is most of it
-    drawn = survey(draw_capture(0, result.params, middle_of(result.stack.select(exposures=chosen))))
+    drawn = _drawn(result.params, result.stack, [found.groups[i].exposure_s for i in chosen])
     pairs = [(found.groups[i], group) for i, group in zip(chosen, drawn.groups, strict=True)]
     for c, channel in enumerate(found.channels):
         of = "" if channel == "mono" else f" of {channel}"
@@ -39,6 +43,35 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
             _, sentence = max(differences(pairs, c, of), default=(0.0, ""))
             if sentence:
                 yield sentence
+
+
+def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Survey:
+    """A survey of darks drawn from the model; of one size, so that a process compiles their drawing once."""
+    key = jax.random.key(0)
+    clean = np.broadcast_to(np.float32(0), (FRAMES, *SHAPE))
+    window = _middle(stack)
+    counts = [
+        sample_by_effect(
+            jax.random.fold_in(named_key(key, "frames"), e),
+            clean,
+            model,
+            exposure_s=exposure_s,
+            sensor_key=named_key(key, "sensor"),
+            window=window,
+        )
+        for e, exposure_s in enumerate(exposures_s)
+    ]
+    taken = {"cfa": stack.cfa, "shutter": stack.shutter, "white_level": stack.white_level}
+    return survey(FrameStack([np.asarray(of) for of in counts], exposure_s=exposures_s, **taken))
+
+
+def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:
+    """Where drawn frames lie on the sensor; None of a smaller one."""
+    free = [size - drawn for size, drawn in zip(stack.shape, SHAPE, strict=True)]
+    if min(free) < 0:
+        return None
+    row, column, *whole = stack.window or (0, 0, *stack.shape)
+    return row + free[0] // 4 * 2, column + free[1] // 4 * 2, whole[0], whole[1]
 
 
 def _chosen(found: Survey) -> list[int]:
@@ -93,8 +126,7 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
 def _typical(group: Group, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels that are no outliers, DN^2, and its standard error."""
     variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
-    limit = (np.median(variance) + 1e-6) * (1 + OUTLYING * np.sqrt(2 / (group.n_frames - 1))) ** 2
-    kept = variance[variance < limit]
+    kept = without_outliers(variance, group.n_frames)
     return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
 
 
@@ -103,9 +135,7 @@ def _median(group: Group, c: int) -> float:
 
 
 def _shared_by_rows(group: Group, c: int) -> Component:
-    parts = [plane.components["row_x_frame"] for plane in group.of(c)]
-    error = float(np.sqrt(sum(part.standard_error_dn2**2 for part in parts))) / len(parts)
-    return Component(float(np.mean([part.variance_dn2 for part in parts])), error)
+    return mean_of([plane.components["row_x_frame"] for plane in group.of(c)])
 
 
 def _rms(one: Component) -> float:

@@ -21,8 +21,3 @@ class Evidence:
     def darks(self) -> PixelFit:
         """Pixel transfer of the darks, whatever the flats say."""
         return measure(self.survey, replace(self.summary, flats=None))
-
-    @property
-    def has_exposures(self) -> bool:
-        """Whether darks of several exposures have two frames or more."""
-        return len({group.exposure_s for group in self.survey.repeated_darks}) > 1

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hsnoise._arguments import MOSAIC, looks_like_a_mosaic
+from hsnoise.decomposition import mean_of
 from hsnoise.doubts._evidence import Evidence
 from hsnoise.flat_notes import stated_gain_note
 from hsnoise.pixels.survey import Group
@@ -36,7 +37,7 @@ def _gain(result: FitResult, seen: Evidence) -> Iterator[str]:
 def _black_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     """A black level that was given, against the level of the darks without signal."""
     given = result.summary.black_level_dn
-    if given is None or result.transfer is None and result.method != "ml" or not seen.has_exposures:
+    if given is None or result.transfer is None and result.method != "ml" or not seen.survey.has_exposures:
         return
     pixel = result.transfer if result.transfer is not None else seen.darks
     darks = seen.survey.darks
@@ -61,7 +62,8 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     noisy = [group for group in seen.survey.groups if group.n_frames > 1 and group.noise_dn > NOISY_DN]
     if not noisy:
         return
-    highest = np.concatenate([_highest(group, seen) for group in noisy])
+    moving = [~seen.survey.stuck(c) for c in range(len(seen.survey.channels))]
+    highest = np.concatenate([_highest(group, moving) for group in noisy])
     top = float(highest.max())
     above = 0.0 if given is None else float((highest > given).mean())
     if above > 0:
@@ -78,12 +80,9 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     yield f"{piled} of the pixels looked at end at a count of {top:g} DN, and {what}: give white_level={top:g}."
 
 
-def _highest(group: Group, seen: Evidence) -> np.ndarray:
+def _highest(group: Group, moving: list[np.ndarray]) -> np.ndarray:
     """The highest count of each pixel that is not stuck."""
-    of = [
-        np.concatenate([p.halves.highest for p in group.of(c)])[~seen.survey.stuck(c)]
-        for c in range(len(seen.survey.channels))
-    ]
+    of = [np.concatenate([p.halves.highest for p in group.of(c)])[kept] for c, kept in enumerate(moving)]
     return np.concatenate(of).astype(np.float64)
 
 
@@ -98,18 +97,17 @@ def _mosaic(result: FitResult, seen: Evidence) -> Iterator[str]:
 
 
 def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:
-    """Rows whose noise follows that of the row before, or does not, against the shutter that was said to be."""
+    """Rows that share noise with the next one, where the shutter was said to be a global one."""
     planes = [plane for group in seen.survey.repeated_darks for plane in group.planes]
-    if not planes:
+    if result.summary.shutter != "global" or not planes:
         return
-    shared = sum(plane.components["row_x_frame"].variance_dn2 for plane in planes)
-    chance = np.sqrt(sum(plane.components["row_x_frame"].chance_dn2 ** 2 for plane in planes))
-    together = sum(plane.rows_together.variance_dn2 for plane in planes)
-    error = np.sqrt(sum(plane.rows_together.chance_dn2**2 for plane in planes))
-    if not shared > ROW_SIGMAS * chance:  # NaN, too
+    shared = mean_of([plane.components["row_x_frame"] for plane in planes])
+    together = mean_of([plane.rows_together for plane in planes])
+    if not shared.variance_dn2 > ROW_SIGMAS * shared.chance_dn2:  # NaN, too
         return
-    if result.summary.shutter == "global" and together > max(ROW_SIGMAS * error, TOGETHER * shared):
+    if together.variance_dn2 > max(ROW_SIGMAS * together.chance_dn2, TOGETHER * shared.variance_dn2):
+        correlation = together.variance_dn2 / shared.variance_dn2
         yield (
-            f"What a row shares in a frame goes on in the next row (correlation {together / shared:.2f}), which a"
+            f"What a row shares in a frame goes on in the next row (correlation {correlation:.2f}), which a"
             " global shutter does not do: the shutter is a rolling one, or the rows have noise of another kind."
         )

@@ -29,7 +29,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
         growth = slope_over(pixels.exposure_s, pixels.level)
         moving = np.flatnonzero(~stuck)
         flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
-    dark = [[p.halves for p in g.of(channel)] for g in found.darks if g.n_frames > 1]
+    dark = [[p.halves for p in g.of(channel)] for g in found.repeated_darks]
     flags[_jumping(dark, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
 

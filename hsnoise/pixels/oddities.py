@@ -98,8 +98,9 @@ def lit_darks(found: Survey) -> Iterator[str]:
     first = found.shortest
     for c, channel in enumerate(found.channels if first is not None else ()):
         of = "" if channel == "mono" else f" of channel {channel}"
+        unlit = _levels(first, c)
         for group in found.repeated_darks:
-            signal = _levels(group, c) - _levels(first, c)
+            signal = _levels(group, c) - unlit
             rise = float(np.median(signal))
             a, b = (one - np.median(one) for one in signal)
             width = float(np.quantile(np.abs(a + b) / 2, 0.99))

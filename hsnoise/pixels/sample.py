@@ -12,6 +12,7 @@ MOST_COUNTS = 1 << 24  # pixels times frames of one exposure in memory
 MOST_OF_SPREAD = 100_000  # pixels that tell the width of a distribution
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from what lies within
 FAR_FRAME = 5.0  # deviations of the frames' offsets from which one of them is an outlier
+OUTLYING = 6.0  # deviations of a pixel's temporal variance that is no noise of it
 FEWEST_ROWS = 24  # that tell the offset of a column in a frame
 
 
@@ -50,6 +51,17 @@ class Halves:
     frame_means_dn: np.ndarray
     pair_variance_dn2: np.ndarray
     frame_noise_dn: np.ndarray
+
+
+def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
+    """What two halves of the frames say alike of the pixels [pixel]: it is free of the noise of estimation."""
+    return float(((a - a.mean()) * (b - b.mean())).mean())
+
+
+def without_outliers(variance: np.ndarray, n_frames: int) -> np.ndarray:
+    """Temporal variances [pixel] over so many frames, without those that are no noise of their pixel."""
+    typical = float(np.median(variance)) + 1e-6
+    return variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (n_frames - 1))) ** 2]
 
 
 def halves_of(counts: np.ndarray) -> Halves:

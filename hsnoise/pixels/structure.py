@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hsnoise.pixels.classes import HOT_SIGMAS
+from hsnoise.pixels.sample import covariance_of
 from hsnoise.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
@@ -144,8 +145,7 @@ def noise_spread(found: Survey, channel: int) -> float:
     a, b = np.concatenate([h.variance_dn2 for h in halves], 1).astype(np.float64)
     top = np.quantile(np.concatenate([a, b]), 0.999)
     a, b = np.minimum(a, top), np.minimum(b, top)
-    covariance = float(((a - a.mean()) * (b - b.mean())).mean())
-    return float(np.sqrt(max(covariance, 0.0)) / max(a.mean(), 1e-12))
+    return float(np.sqrt(max(covariance_of(a, b), 0.0)) / max(a.mean(), 1e-12))
 
 
 def has_patterns(found: Survey) -> bool:

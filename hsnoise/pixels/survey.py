@@ -111,6 +111,11 @@ class Survey:
         return tuple(group for group in self.darks if group.n_frames > 1)
 
     @property
+    def has_exposures(self) -> bool:
+        """Whether `repeated_darks` are of several exposures."""
+        return len({group.exposure_s for group in self.repeated_darks}) > 1
+
+    @property
     def shortest(self) -> Group | None:
         """The shortest of `repeated_darks`; None without any."""
         return min(self.repeated_darks, key=lambda group: group.exposure_s, default=None)
