@@ -99,3 +99,13 @@ def test_frames_that_were_smoothed_are_named(good):
     fit = hsnoise.fit(np.round((counts + np.roll(counts, 1, 3)) / 2).astype(np.uint16), exposure_s=EXPOSURES_S)
     assert any("smoothed, denoised" in doubt for doubt in fit.doubts), fit.doubts
     assert not fit.trustworthy
+
+
+def test_flats_of_unequal_light_are_not_taken_for_smoothed(good):
+    random = np.random.default_rng(3)
+    saddle = np.multiply.outer(*(np.linspace(-1, 1, size) for size in SHAPE))
+    light = np.array([8000.0, 9500.0])[:, None, None] * (1 + 0.5 * saddle)
+    counts = BLACK + GAIN * random.poisson(np.broadcast_to(light, (2, *SHAPE)))
+    flats = hsnoise.FrameStack(counts.astype(np.uint16)[None], exposure_s=(1.0,), kind="flat")
+    fit = hsnoise.fit(hsnoise.FrameStack.join(good.stack, flats))
+    assert not any("smoothed" in doubt for doubt in fit.doubts), fit.doubts

@@ -83,7 +83,8 @@ def _colours(found: Survey) -> Iterator[str]:
 
 def _smoothed(found: Survey) -> Iterator[str]:
     """Noise that neighbours share: a pixel's variance is then no measure of its electrons."""
-    planes = [(plane.neighbours_share, group) for group in found.groups for plane in group.planes if group.n_frames > 1]
+    # Darks only: light that differs between two flats brings their pattern into what changes.
+    planes = [(plane.neighbours_share, group) for group in found.repeated_darks for plane in group.planes]
     wide = [one for one in planes if one[1].noise_dn > LEAST_LEVEL_DN]
     share, group = max(wide, key=lambda one: one[0], default=(0.0, None))
     if group is not None and share > SMOOTHED:
