@@ -185,6 +185,11 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
     return fit_synthetic(base, part, model)
 
 
+def rechecked(result: FitResult, stack) -> FitResult:
+    """The result with the doubts of its own model, instead of those of the fit that it went on from."""
+    return checked(result, Evidence(_surveyed(stack), result.summary))
+
+
 def _surveyed(stack) -> Survey:
     """A survey of the stack, or where it is large of a part: enough to tell whether pixels differ."""
     _check_size(stack)

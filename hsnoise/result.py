@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise import rows
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise._types import unit_in_words
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, binning, dark_laws, log_probability
@@ -74,6 +75,22 @@ class FitResult:
     def trustworthy(self) -> bool:
         """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
         return self.converged and not self.grave
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether these numbers may be used, and the first reason against it."""
+        if not self.converged:
+            return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
+        if not self.doubts:
+            return Conclusion(Light.GREEN, "Nothing in these frames contradicts the fit.")
+        first = self.doubts[0]
+        others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
+        # That there is no gain is no error: noise in DN can be used.
+        if not self.has_gain and not others:
+            return Conclusion(Light.AMBER, f"In DN only. {first}")
+        if self.grave:
+            return Conclusion(Light.RED, f"Do not use these numbers. {first}{others}")
+        return Conclusion(Light.AMBER, f"Usable, with doubts. {first}{others}")
 
     @property
     def has_gain(self) -> bool:

@@ -6,7 +6,6 @@ import re
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,7 +145,7 @@ def test_a_page_says_what_was_found(pages, compared):
     said = {command: Elements(page).text for command, page in pages.items()}
     worst = max(compared.groups, key=compared.groups.__getitem__)
     error = _context.number(compared.error)
-    assert f"The model fails these frames, most of all in {worst}: error {error}, 1.0 would be" in said["compare"]
+    assert f"most of all in {worst}: error {error}, 1.0 would be" in said["compare"]
     assert f"Missing: row_noise; error {error}, 1.0 would be as close" in said["diagnose"]
     assert "Added row_noise, and the error fell from 88.1 to 1.1; nothing significant is left" in said["improve"]
     assert "gain.R moved from 3.1 to 3.5 DN/e-." in said["improve"] and "+80.0 nats" in said["improve"]
@@ -164,28 +163,30 @@ def test_text_of_users_is_escaped(pages):
 
 
 @pytest.mark.parametrize(
-    ("found", "said", "good"),
+    ("found", "said", "light"),
     [
-        (comparison(), "The model describes these frames: error 1.1", True),
-        (comparison(5.0, 0.11), "The model fails these frames, most of all in row x frame: error 5, 1.0", False),
-        (diagnosis("nothing missing", ()), "Nothing significant is missing.", True),
-        (diagnosis("ambiguous", ("a", "b")), "Missing: a or b.", False),
-        (diagnosis("unexplained", ()), "Something is left that no effect of the library explains.", False),
-        (SimpleNamespace(steps=(SimpleNamespace(added=None),), ended="It stopped."), "It stopped.", None),
+        (comparison(), "The model describes these frames: error 1.1", "green"),
+        (comparison(5.0, 0.11), "The model comes close to these frames, but fails most of all in row x fr", "amber"),
+        (
+            comparison(50.0, 0.11),
+            "The model does not describe these frames, most of all in row x frame: error 50",
+            "red",
+        ),
+        (diagnosis("nothing missing", ()), "Nothing significant is missing.", "green"),
+        (diagnosis("ambiguous", ("a", "b")), "Missing: a or b.", "amber"),
+        (diagnosis("unexplained", ()), "Something is left that no effect of the library explains.", "red"),
     ],
-    ids=["good", "bad, few draws", "nothing", "ambiguous", "unexplained", "no step"],
+    ids=["good", "close, few draws", "bad", "nothing", "ambiguous", "unexplained"],
 )
-def test_verdicts(found, said, good):
-    if good is None:
-        assert _context._verdict_of_story(found) == said
-        return
-    assert _context.verdict(found, found if isinstance(found, Comparison) else None).startswith(said)
-    assert _context.is_good(found) is good
+def test_conclusions(found, said, light):
+    shown = _context.conclusion(found, found if isinstance(found, Comparison) else None)
+    assert shown.sentence.startswith(said) and shown.light == light
 
 
 def test_a_model_of_another_capture_is_no_good_news():
     """Base parameters that are off are projected out by a diagnosis; the error of the comparison tells."""
-    assert "does not fit" in _context.verdict(diagnosis("nothing missing", ()), comparison(300.0))
+    shown = _context.conclusion(diagnosis("nothing missing", ()), comparison(300.0))
+    assert "does not fit" in shown.sentence and shown.light == "red"
 
 
 def test_bars_are_ordered_and_share_a_scale():

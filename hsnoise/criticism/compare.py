@@ -10,11 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from hsnoise._arguments import callback, seed_of, whole_number
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
+from hsnoise.result import number
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.structure import explained
 
@@ -22,6 +24,8 @@ DRAWS = 40
 WORST = 5  # statistics told in words
 NOTABLE_Z = 4.0
 NOTABLE_GAIN = 1.0  # in z, of a statistic that came nearer
+CHANCE_P, FITS = 0.05, 3.0  # p-value and error of a model that fits: few draws give no small p-value
+CLOSE = 10.0  # error below which a model is of use, with doubts
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,24 @@ class Comparison:
     p_value: float
     log_likelihood_per_pixel: float
     skipped: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the capture could have been drawn from the model."""
+        return self.p_value > CHANCE_P and self.error < FITS
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether the model describes the capture, and in which group of statistics it fails most."""
+        error = f"error {number(self.error)}"
+        if self.fits:
+            sentence = f"The model describes these frames: {error}, where 1.0 is as close as its own samples."
+            return Conclusion(Light.GREEN, sentence)
+        worst = max(self.groups, key=self.groups.__getitem__)
+        light = Light.AMBER if self.error < CLOSE else Light.RED
+        how = "comes close to these frames, but fails" if light == Light.AMBER else "does not describe these frames,"
+        sentence = f"The model {how} most of all in {worst}: {error}, 1.0 would be as close as its own samples."
+        return Conclusion(light, sentence)
 
     @property
     def own_misfit(self) -> float:

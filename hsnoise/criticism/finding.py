@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
@@ -71,6 +72,15 @@ class Diagnosis:
         if not self.names:
             return self.verdict
         return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether the model lacks something, and what."""
+        if self.verdict == "nothing missing":
+            return Conclusion(Light.GREEN, "Nothing significant is missing.")
+        if self.verdict == "unexplained":
+            return Conclusion(Light.RED, "Something is left that no effect of the library explains.")
+        return Conclusion(Light.AMBER, f"{self.headline[0].upper()}{self.headline[1:]}.")
 
     @property
     def named(self) -> tuple[Candidate, ...]:

@@ -18,7 +18,7 @@ from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import CHANCE_ERROR, FINISHED, Step, Story
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.fit import WITH_LIKELIHOOD, fit
+from hsnoise.fit import WITH_LIKELIHOOD, fit, rechecked
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack, as_stack
@@ -151,7 +151,7 @@ class _Work:
             step = self.with_one_more(steps, candidate)
             reason = "could not be fitted" if step is None else self.refusal(candidate.effect, step, steps[-1])
             if not reason:
-                return step, refused
+                return replace(step, fit=rechecked(step.fit, self.fitted)), refused
             refused[candidate.name] = reason
             self.say(f"{candidate.name} is left out, {reason}")
         return None, refused

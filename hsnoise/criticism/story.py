@@ -9,8 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise._types import unit_in_words
-from hsnoise.criticism.compare import Comparison, nearer
+from hsnoise.criticism.compare import CLOSE, FITS, Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
 from hsnoise.fit import without_likelihood
 from hsnoise.model import NoiseModel
@@ -77,6 +78,27 @@ class Story:
     def finished(self) -> bool:
         """Whether nothing significant was left at the end."""
         return self.ended.startswith(FINISHED)
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether the last model may be used, and what became of the error."""
+        error, last = self.errors[-1], self.fit.conclusion
+        if last.light == Light.RED or error >= CLOSE:
+            light = Light.RED
+        else:
+            light = last.light if self.finished and error < FITS else Light.AMBER
+        doubt = "" if last.light == Light.GREEN else f" {last.sentence}"
+        return Conclusion(light, f"{self._in_short()}{doubt}")
+
+    def _in_short(self) -> str:
+        """What was added, what became of the error, why the story ended."""
+        added = [step.added for step in self.steps if step.added]
+        if not added:
+            return self.ended
+        first, last = self.errors[0], self.errors[-1]
+        how = "fell" if last < first else "went"
+        ended = (self.ended[0].lower() + self.ended[1:]).replace(f" (error {last:.2f})", "")  # it is said already
+        return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}"
 
     @property
     def start(self) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.decomposition import COMPONENTS, Component
 from hsnoise.inspection._facts import Facts, GroupFacts, facts_of
@@ -46,6 +47,13 @@ class Inspection:
     fit_makes_sense: bool
     next_capture: str
     budget: NoiseBudget | None
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether a fit makes sense, and whether something about the frames is odd."""
+        if not self.fit_makes_sense:
+            return Conclusion(Light.RED, self.verdict)
+        return Conclusion(Light.AMBER if self.findings else Light.GREEN, self.verdict)
 
     def __str__(self) -> str:
         head, levels, *_ = repr(self.stack).splitlines()

@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._conclusion import Conclusion, Light
 from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
-from hsnoise.criticism.compare import nearer
+from hsnoise.criticism.compare import FITS, nearer
 from hsnoise.criticism.story import together
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack
 from hsnoise.structure import explained
 
-CHANCE = 0.05  # p-value from which a misfit is taken for chance,
-CLEAR = 3.0  # unless the error is beyond this: few draws give no small p-value
 ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars
+YARDSTICK = "1.0 would be as close as the model's own samples"
 MOST_CANDIDATES, MOST_FILES = 10, 3
 TITLES = {Comparison: "Model against measurement", Diagnosis: "What is missing", Story: "How the model was improved"}
 
@@ -44,8 +44,7 @@ def context(
     return {
         "title": TITLES[type(found)],
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
-        "verdict": verdict(found, comparison),
-        "good": is_good(found) and (comparison is None or comparison.error < CLEAR),
+        "conclusion": conclusion(found, comparison),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
         "notes": fit.notes if isinstance(fit, FitResult) else (),
@@ -61,45 +60,17 @@ def context(
     }
 
 
-def verdict(found: Comparison | Diagnosis | Story, comparison: Comparison | None) -> str:
-    """The finding in one sentence."""
-    if isinstance(found, Story):
-        return _verdict_of_story(found)
-    error = "" if comparison is None else f"error {number(comparison.error)}"
-    yardstick = f"{error}, 1.0 would be as close as the model's own samples"
-    if isinstance(found, Comparison):
-        if is_good(found):
-            return f"The model describes these frames: {error}, where 1.0 is as close as its own samples."
-        worst = max(found.groups, key=found.groups.__getitem__)
-        return f"The model fails these frames, most of all in {worst}: {yardstick}."
-    after = f"; {yardstick}" if error else ""
-    if found.verdict == "nothing missing" and comparison is not None and comparison.error >= CLEAR:
-        return f"No effect stands out, but the model does not fit these frames ({error}): is it a fit of this capture?"
-    if found.verdict == "nothing missing":
-        return f"Nothing significant is missing{f' ({error})' if error else ''}."
-    if found.verdict == "unexplained":
-        return f"Something is left that no effect of the library explains{after}."
-    return f"{found.headline[0].upper()}{found.headline[1:]}{after}."
-
-
-def _verdict_of_story(story: Story) -> str:
-    added = [step.added for step in story.steps if step.added]
-    if not added:
-        return story.ended
-    first, last = story.errors[0], story.errors[-1]
-    how = "fell" if last < first else "went"
-    ended = (story.ended[0].lower() + story.ended[1:]).replace(f" (error {last:.2f})", "")  # it is said already
-    return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}"
-
-
-def is_good(found: Comparison | Diagnosis | Story) -> bool:
-    """Whether nothing significant is left to find."""
-    if isinstance(found, Comparison):
-        return found.p_value > CHANCE and found.error < CLEAR
-    if isinstance(found, Story):
-        last = found.steps[-1].diagnosis
-        return found.finished or (last is not None and last.verdict == "nothing missing")
-    return found.verdict == "nothing missing"
+def conclusion(found: Comparison | Diagnosis | Story, comparison: Comparison | None) -> Conclusion:
+    """The finding in one sentence, with the error of the model that a diagnosis is about."""
+    said = found.conclusion
+    if not isinstance(found, Diagnosis) or comparison is None:
+        return said
+    error = f"error {number(comparison.error)}"
+    if found.verdict == "nothing missing" and comparison.error >= FITS:
+        text = f"No effect stands out, but the model does not fit these frames ({error}): is it a fit of this capture?"
+        return Conclusion(Light.RED, text)
+    after = f" ({error})" if found.verdict == "nothing missing" else f"; {error}, {YARDSTICK}"
+    return Conclusion(said.light, f"{said.sentence.removesuffix('.')}{after}.")
 
 
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:

@@ -1,0 +1,25 @@
+"""The finding in one sentence, with a light: may it be used?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Light(StrEnum):
+    """Whether a result may be used."""
+
+    GREEN = "green"  # it fits
+    AMBER = "amber"  # with doubts
+    RED = "red"  # do not use this
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What a reader should know first: `light`, and why in one `sentence`."""
+
+    light: Light
+    sentence: str
+
+    def __str__(self) -> str:
+        return f"[{self.light}] {self.sentence}"
