@@ -20,7 +20,7 @@ from hsnoise.maximise import maximise
 from hsnoise.model import NoiseModel
 from hsnoise.moments import start_physics
 from hsnoise.notes import closing_notes, outlier_fraction
-from hsnoise.physics import Physics, flat_gain_of
+from hsnoise.physics import WITH_LIKELIHOOD, Physics, flat_gain_of
 from hsnoise.pixel_fit import measure
 from hsnoise.pixel_result import POPULATION, result_of
 from hsnoise.pixels.structure import can_be_transferred, pixels_differ
@@ -42,7 +42,6 @@ AT_EDGE = (
     "{} lies at a step of the likelihood, where the rows whose gain the model clips at 0 are rounded to the next count:"
     " it is known to half a count only. Such rows are a sign of an effect that the model lacks: hsnoise.compare tells."
 )
-WITH_LIKELIHOOD = tuple(effect.name for effect in (*BASE_EFFECTS, BlackClamp))
 
 
 def without_likelihood(model: NoiseModel) -> tuple[str, ...]:

@@ -80,12 +80,12 @@ class RowRule(eqx.Module):
 
 
 Rules = tuple[RowRule, ...]
+WITH_LIKELIHOOD = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc", "black_clamp")
 
 
 def physics_of(model: NoiseModel) -> Physics:
     """The base parameters of a model in float64. Raises ValueError for effects without a likelihood."""
-    known = {"shot_noise", "dark_current", "read_noise", "gain", "row_gain", "black_level", "black_clamp", "adc"}
-    extra = [effect.name for effect in model.effects if effect.name not in known]
+    extra = [effect.name for effect in model.effects if effect.name not in WITH_LIKELIHOOD]
     if extra:
         raise ValueError(f"log_likelihood: effects {extra} do not state how they change the likelihood")
     n = len(model.channels)

@@ -21,6 +21,7 @@ KEEP_NATS = 25.0  # a node where every row of a group is this far below its best
 # In beta on either side: so that the parameters may move during a fit, and where they are almost known.
 MARGIN, CLOSE_MARGIN = 1.35, 1.05
 EXTREME_ROWS = 6
+LEAST_SIGMA = 1e-6  # a fit may end at a row gain of exactly 0
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
 # Further nodes: where the integrand ends at a gain of zero, or each of few rows counts; and where errors average out.
@@ -142,7 +143,7 @@ def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
     best = np.where(seen, information, 0).max(1) * histograms.row_pixels.max((1, 2))
     # The prior is part of what the nodes must resolve: its width in u where the rows are densest.
-    width = np.minimum(1 / np.sqrt(best + 1e-12), sigma / np.sqrt(scale**2 + 1))[:, None]
+    width = np.minimum(1 / np.sqrt(best + 1e-12), max(sigma, LEAST_SIGMA) / np.sqrt(scale**2 + 1))[:, None]
     top, bottom = 1 + rows.PRIOR_REACH * sigma, max(1 - rows.PRIOR_REACH * sigma, 0.0)
     low, high = low / margin, high * margin
     if summary.shutter == "rolling":

@@ -23,7 +23,7 @@ from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at
 from hsnoise.model import NoiseModel
 from hsnoise.notes import near_zero, parameter_notes
-from hsnoise.physics import Physics, physics_of
+from hsnoise.physics import WITH_LIKELIHOOD, Physics, physics_of
 from hsnoise.plan import plan_rules, replan
 from hsnoise.result import NOT_CONVERGED, FitResult
 from hsnoise.stack import FrameStack
@@ -136,7 +136,7 @@ class Problem:
     def other_start(self) -> np.ndarray | None:
         """Where the base parameters are those of `model`, which may know more of the effects than `base` did."""
         own = NoiseModel(
-            [self.given[name] for name in self.base.params.names],
+            [self.given[name] for name in self.base.params.names if name in WITH_LIKELIHOOD],
             cfa=self.given.cfa,
             shutter=self.given.shutter,
             exposure_s=self.given.exposure_s,
@@ -309,7 +309,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         params=problem.in_float64(y),
         physics=problem.physics(y),
         names=(*base.names, *(knob.label for knob in problem.knobs)),
-        covariance=_not_surer_than(base.covariance, turn @ covariance @ turn.T),
+        covariance=_not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
         method="synthetic",
         outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
         iterations=iterations,
@@ -319,6 +319,20 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     of_line = base.notes if base.method == "line" else ()
     told = (f"{how} parameters.", *of_line, *_loose(problem, covariance, result), *parameter_notes(result))
     return result.with_notes(tuple(dict.fromkeys(told)))
+
+
+def _in_order(problem: Problem, covariance: np.ndarray) -> np.ndarray:
+    """`covariance` of coordinates and knobs in the order of the table; what the base fit measured keeps its own."""
+    base, knobs_ = problem.base, [knob.label for knob in problem.knobs]
+    moved = [*labels(problem.coordinates, base.params.channels), *knobs_]
+    names = [*base.names, *knobs_]
+    whole = np.zeros((len(names), len(names)))
+    whole[: len(base.names), : len(base.names)] = base.covariance
+    here = [i for i, name in enumerate(names) if name in moved]
+    there = [moved.index(names[i]) for i in here]
+    whole[here] = whole[:, here] = 0.0
+    whole[np.ix_(here, here)] = covariance[np.ix_(there, there)]
+    return whole
 
 
 def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:

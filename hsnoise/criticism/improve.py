@@ -18,8 +18,9 @@ from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import CHANCE_ERROR, FINISHED, Step, Story
 from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.fit import WITH_LIKELIHOOD, fit, rechecked
+from hsnoise.fit import fit, rechecked
 from hsnoise.model import NoiseModel
+from hsnoise.physics import WITH_LIKELIHOOD
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack, as_stack
 from hsnoise.synthetic import fit_synthetic
