@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from hsnoise import cameras
+from hsnoise import cameras, examples
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
@@ -31,6 +31,7 @@ __all__ = [
     "cameras",
     "compare",
     "diagnose",
+    "examples",
     "fit",
     "improve",
     "inspect",

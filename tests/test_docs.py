@@ -1,78 +1,147 @@
-"""The code in the documentation runs as it stands."""
+"""What stands in the documentation runs: each block of code, in order, in a fresh folder beside a real capture."""
 
 from __future__ import annotations
 
 import re
+import shlex
+import subprocess
 import sys
 import types
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from skimage.data import astronaut, coffee
+from skimage.io import imsave
 
 import hsnoise
+from hsnoise.cli import main
 
-DOCS = Path(__file__).parent.parent / "docs"
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE, WORDS = {"python", "sh", "console"}, {"text"}
+# Long work in little: added to the command, the last of an option counts.
+IN_LITTLE = {
+    "improve": ["--max-steps", "0"],
+    "train": ["--steps", "2", "--preset", "smoke"],
+    "evaluate": ["--no-rivals", "--crop", "32"],
+}
 
 
-def code_of(page: str) -> str:
-    return "\n".join(re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL))
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Language and content of each block of a page."""
+    return BLOCK.findall(page.read_text())
 
 
-def test_page_on_effects_of_ones_own_runs(capsys, monkeypatch):
-    code = code_of("add-an-effect.md")
-    assert "class DiagonalStreaks" in code
-    page = types.ModuleType("page")
-    monkeypatch.setitem(sys.modules, "page", page)
-    exec(compile(code, "add-an-effect.md", "exec"), page.__dict__)
-    said = capsys.readouterr().out
-    assert "missing: diagonal_streaks" in said and "synthetic likelihood" in said
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def commands(block: str) -> list[str]:
+    """The commands of a block for a shell; of a transcript those behind the prompt."""
+    lines = block.replace("\\\n", " ").splitlines()
+    if any(line.startswith("$ ") for line in lines):
+        lines = [line[2:] for line in lines if line.startswith("$ ")]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+def without_numbers(text: str) -> list[str]:
+    return re.sub(r"[^A-Za-z]+", " ", text).split()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A fresh folder with what a reader has: frames of a camera, a picture, videos."""
+    night = hsnoise.examples.st8(tmp_path / "night")
+    for name in ("dark3s", "dark25s", "flat3s"):
+        of = tmp_path / ("flats" if name == "flat3s" else "darks")
+        of.mkdir(exist_ok=True)
+        for path in (night / name).iterdir():
+            (of / f"{name}_{path.name}").write_bytes(path.read_bytes())
+    imsave(tmp_path / "scene.png", astronaut()[:192, :256], check_contrast=False)
+    (tmp_path / "clips").mkdir()
+    for i in range(4):
+        frames = np.stack([coffee()[20 * i : 20 * i + 96, 3 * f : 3 * f + 128] for f in range(12)])
+        np.savez(tmp_path / "clips" / f"clip{i}.npz", frames=frames)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Reader:
+    """Runs a page: Python blocks share their names, commands of hsnoise run in this process."""
+
+    def __init__(self, page: Path, monkeypatch, capsys) -> None:
+        self.page, self.capsys = page, capsys
+        self.module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
+        self.module.__dict__.update(np=np, jax=jax, hsnoise=hsnoise)
+        monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
+
+    def run(self, language: str, block: str) -> None:
+        if language == "python":
+            exec(compile(block, name_of(self.page), "exec"), self.module.__dict__)
+        elif language in ("sh", "console"):
+            said = "".join(self.command(line) for line in commands(block))
+            if language == "console":
+                self.compare(block, said)
+
+    def command(self, line: str) -> str:
+        """Run one command; returns what it prints."""
+        program, *words = shlex.split(line, comments=True)
+        if program == "make":  # installs an environment: tests/test_package.py does that
+            words = [word for word in words if "=" not in word]
+            return subprocess.run(["make", "-n", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        assert program == "hsnoise", f"no such command is run here: {line}"
+        self.capsys.readouterr()
+        status = main([*words, *IN_LITTLE.get(words[0], [])])
+        out, err = self.capsys.readouterr()
+        assert status == 0, f"{line}: exit status {status}\n{out}\n{err}"
+        return out
+
+    def compare(self, block: str, said: str) -> None:
+        """Whether a transcript shows words that the command still prints."""
+        printed = " ".join(without_numbers(said))
+        for line in block.splitlines():
+            words = " ".join(without_numbers(line))
+            if words and not line.startswith("$ ") and line.strip() != "...":
+                assert words in printed, f"{name_of(self.page)} shows what is not printed: {line}\n{said}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_block_says_what_it_is(page):
+    """Code is code that runs, or it is called text; blocks by indentation would escape."""
+    languages = {language for language, _ in blocks(page)}
+    assert languages <= CODE | WORDS, languages
+    outside = BLOCK.sub("", page.read_text())
+    assert "```" not in outside
+    assert not re.search(r"\n\n    \S", outside)
+    for language, block in blocks(page):
+        if language == "text":
+            assert not re.match(r"(\$ )?(hsnoise|pip|make|python|import|from) ", block), block
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if CODE & {kind for kind, _ in blocks(page)}], ids=name_of)
+def test_page_runs(page, folder, monkeypatch, capsys):
+    reader = Reader(page, monkeypatch, capsys)
+    for language, block in blocks(page):
+        reader.run(language, block)
+    CHECKS.get(page.stem, lambda _: None)(reader.module)
+
+
+def _own_effect(page) -> None:
     value, error, _ = page.again.table["diagonal_streaks.sigma"]
     assert abs(value - 1.2) < 4 * error
 
 
-def test_page_on_sampling_runs_and_finds_the_numbers():
-    page = {"__name__": "page"}
-    exec(compile(code_of("sampling.md"), "sampling.md", "exec"), page)
-    assert page["dark_current"] == pytest.approx(118, rel=0.1)
-    assert page["read_noise"] == pytest.approx(2.33, rel=0.1)
-    np.testing.assert_array_equal(page["counts"], hsnoise.sample(jax.random.key(0), page["clean"], page["camera"]))
+def _sampling(page) -> None:
+    assert page.dark_current == pytest.approx(118, rel=0.1)
+    assert page.read_noise == pytest.approx(2.33, rel=0.1)
+    np.testing.assert_array_equal(page.counts, hsnoise.sample(jax.random.key(0), page.clean, page.camera))
 
 
-def test_pytorch_takes_the_draws_without_a_copy():
-    torch = pytest.importorskip("torch")
-    (block,) = [
-        b
-        for b in re.findall(r"```python notest\n(.*?)```", (DOCS / "sampling.md").read_text(), re.DOTALL)
-        if "torch" in b
-    ]
-    page = {"jax": jax, "jnp": jnp, "hsnoise": hsnoise, "camera": hsnoise.cameras.grasshopper3()}
-    exec(compile(block, "sampling.md", "exec"), page)
-    light = torch.full((2, 32, 64), 3.0)
-    drawn = page["noisy"](1, light)
-    assert drawn.shape == light.shape and drawn.dtype == torch.float32
-    expected = hsnoise.sample(jax.random.key(1), np.full((2, 32, 64), 3.0, np.float32), page["camera"])
-    np.testing.assert_array_equal(drawn.numpy(), np.asarray(expected, np.float32))
-    # The same memory on both sides.
-    array = jax.dlpack.from_dlpack(light)
-    assert array.unsafe_buffer_pointer() == light.data_ptr()
-    assert torch.from_dlpack(array).data_ptr() == array.unsafe_buffer_pointer()
-    # In a training loop: the loss of a network on fresh noise falls.
-    torch.manual_seed(0)
-    network, losses = torch.nn.Conv2d(1, 1, 5, padding=2), []
-    optimiser = torch.optim.Adam(network.parameters(), 1e-2)
-    for step in range(30):
-        loss = ((network(page["noisy"](step, light)[:, None])[:, 0] - light) ** 2).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.2 * losses[0]
+def _enhancer(page) -> None:
+    assert page.enhanced.shape == (48, 64, 3) and np.isfinite(page.enhanced).all()
 
 
-def test_page_on_the_enhancer_runs():
-    page = {"__name__": "page"}
-    exec(compile(code_of("enhancer.md"), "enhancer.md", "exec"), page)
-    assert page["enhanced"].shape == (48, 64, 3) and np.isfinite(page["enhanced"]).all()
+CHECKS = {"add-an-effect": _own_effect, "sampling": _sampling, "enhancer": _enhancer}

@@ -174,3 +174,25 @@ class TestRealSensors:
         fit = hsnoise.fit(hsnoise.load(shared_data / "data" / "sbig_st8_cc0", progress=False))
         assert 1 / fit.table["gain"][0] == pytest.approx(2.69, rel=0.01)
         assert fit.trustworthy
+
+
+@pytest.mark.parametrize("fall_dn", [0.0, 3.0])
+def test_hot_pixels_are_measured_from_the_ordinary_ones_when_the_pedestal_falls(fall_dn, rng):
+    """The pedestal of a real CCD was 2 DN lower at 25 s: 690 e-/s instead of 3.3 came out for its hot pixels."""
+    gain, fraction, rate, exposure_s = 0.4, 0.004, 5.0, (3.0, 25.0)
+    hot = np.where(rng.random((160, 256)) < fraction, rng.exponential(rate, (160, 256)), 0.0)
+    darks = [
+        gain * (rng.poisson(hot * t, (6, 160, 256)) + rng.normal(0, 20, (6, 160, 256))) + 900 - fall_dn * (t > 10)
+        for t in exposure_s
+    ]
+    light = [gain * (rng.poisson(e, (4, 160, 256)) + rng.normal(0, 20, (4, 160, 256))) + 900 for e in (5e3, 2e4)]
+    counts = [np.rint(one).astype(np.uint16) for one in (*darks, *light)]
+    stack = hsnoise.FrameStack(
+        counts, exposure_s=[*exposure_s, 1.0, 1.0], kind=["dark", "dark", "flat", "flat"], shutter="global"
+    )
+    fit = hsnoise.fit(stack)
+    value, error, _ = fit.table["hot_pixels.rate"]
+    share, chance, _ = fit.table["hot_pixels.fraction"]
+    truth = float(hot[hot > 0].mean())
+    assert abs(value - truth) < 4 * np.hypot(error, 0.1 * truth) and error < 0.5 * truth
+    assert abs(share - fraction) < 4 * chance

@@ -72,16 +72,20 @@ def population_of(
     apart = np.abs(halves[0] - halves[1])
     steady = (apart < APART_SIGMAS * 2 * noise) | (apart < APART_SHARE * 2 * np.abs(growth))
     growth = growth[steady].astype(np.float64)
-    values, errors = _fitted(growth, noise)
+    # A pedestal that falls by more than dark signal rises is common to all pixels: they are measured from there.
+    fallen = min(float(np.median(growth)), 0.0)
+    values, errors = _fitted(growth - fallen, noise)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[2:], errors[2:] = 0.0, np.inf
     body, spread, fraction, rate = values
     # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
-    cut = _mean_below(limit - pedestal_dn_per_s, noise, values)
-    mean = ordinary + (body - cut if spread > 0 or fraction > 0 else 0.0)
-    if fraction > 0:  # whatever the shape of the tail, its charge is kept
+    cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
+    beyond = body - cut if spread > 0 or fraction > 0 else 0.0
+    mean = ordinary + beyond
+    if fraction > 0:  # whatever the shape of the tail, its charge is kept; moving pedestals are in both means
         total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
-        rate = max((total - mean) / fraction, 0.0)
+        measured = float(growth[growth < limit - pedestal_dn_per_s].mean()) + beyond
+        rate = max((total - measured) / fraction, 0.0)
         errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
     shortest = float(pixels.exposure_s.min())
     return Population(
@@ -146,6 +150,8 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
     def loss(theta: np.ndarray) -> float:
+        if middle <= 0:  # no dark current of ordinary pixels, which could differ
+            theta = np.array([0.0, np.log(1e-3), *theta[2:]])
         cdf = growth_cdf(edges, noise, *_natural(theta, core))
         return -float(counts @ np.log(np.maximum(np.diff(np.concatenate([[0.0], cdf, [1.0]])), 1e-12)))
 
