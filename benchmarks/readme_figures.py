@@ -23,9 +23,10 @@ from hsnoise.draws import darks_of, draw_capture
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
-ROWS, COLUMNS = slice(40, 200), slice(60, 300)  # of the frames that are shown
-STRETCH = (1.0, 99.7)  # percentiles of the measured frame that are black and white
+ROWS, COLUMNS = slice(10, 190), slice(20, 290)  # of the frames that are shown
+STRETCH = (0.5, 99.9)  # percentiles of the measured frame that are black and white
 INK = ("#404040", "#0072B2", "#D55E00")
+NAMES = ("measured: a CCD in the dark", "textbook model: Poisson and Gaussian", "what hsnoise made of it")
 
 
 def textbook(stack: FrameStack, gain: float) -> NoiseModel:
@@ -37,32 +38,26 @@ def textbook(stack: FrameStack, gain: float) -> NoiseModel:
 
 
 def hero(stack: FrameStack, model: NoiseModel) -> Figure:
-    """A frame of the longest darks, one of the textbook model, one of the fitted model, and the row means below each."""
+    """The mean of the longest darks, that of the textbook and of the fitted model, and below each its column means."""
     darks = darks_of(stack)
     plain = textbook(darks, float(np.asarray(model["gain"].value).ravel()[0]))
-    sides = [
-        np.stack(list(of.frames(len(of.counts) - 1))).astype(float)
-        for of in (darks, draw_capture(1, plain, darks), draw_capture(1, model, darks))
-    ]
-    level = np.median(sides[0])
-    low, high = np.percentile(sides[0][0], STRETCH)
-    figure = Figure(figsize=(12, 5.2), dpi=110, layout="constrained")
-    axes = figure.subplots(2, 3, height_ratios=[2.2, 1], sharey="row")
-    names = ("measured: a real dark frame", "textbook: Poisson and Gaussian", "drawn from the fitted model")
-    for column, (frames, name, ink) in enumerate(zip(sides, names, INK, strict=True)):
-        above, below = axes[:, column]
-        above.imshow(
-            frames[0][ROWS, COLUMNS], cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="equal"
-        )
-        above.set_title(name, fontsize=12)
+    drawn = (darks, draw_capture(1, plain, darks), draw_capture(1, model, darks))
+    means = [np.mean(list(of.frames(len(of.counts) - 1)), axis=0, dtype=float) for of in drawn]
+    means = [one - np.median(one) for one in means]
+    low, high = np.percentile(means[0][ROWS, COLUMNS], STRETCH)
+    figure = Figure(figsize=(12, 5.4), dpi=110, layout="constrained")
+    axes = figure.subplots(2, 3, height_ratios=[2.6, 1], sharey="row")
+    for (above, below), mean, name, ink in zip(axes.T, means, NAMES, INK, strict=True):
+        part = mean[ROWS, COLUMNS]
+        above.imshow(part, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
+        above.set_title(name, fontsize=13)
         above.set_xticks([])
         above.set_yticks([])
-        columns = frames.mean(0).mean(0)
-        below.plot(columns - np.median(columns), color=ink, linewidth=0.9)
+        below.plot(part.mean(0) - np.median(part.mean(0)), color=ink, linewidth=1.0)
         below.spines[["top", "right"]].set_visible(False)
-    axes[1, 0].set_ylabel("column mean / DN")
-    for below in axes[1]:
+        below.margins(x=0)
         below.set_xlabel("column")
+    axes[1, 0].set_ylabel("column mean / DN")
     return figure
 
 

@@ -12,8 +12,8 @@ from hsnoise._output import write_atomically
 def st8(folder: str | PathLike) -> Path:
     """Write the example capture to a folder, as its owner would keep it: FITS files in dark3s/, dark25s/ and flat3s/.
 
-    It is of an SBIG ST-8, an astronomical CCD camera, at -10 degrees Celsius: 6 darks of 3 s, 7 darks of 25 s and 5 flats
-    of 3 s, 240 x 320 pixels from the middle of the sensor. Public domain (CC0); its README.txt names the source.
+    It is of an SBIG ST-8, an astronomical CCD camera, at -10 degrees Celsius: 6 darks of 3 s, 7 darks of 25 s and 5
+    flats of 3 s, 240 x 320 pixels from the middle of the sensor. Public domain (CC0); its README.txt names the source.
 
     Args:
         folder: is made if it does not exist; files of the same names are replaced.
