@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -64,7 +66,8 @@ def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
         names = set(file.namelist())
     package = {path.relative_to(ROOT).as_posix() for path in (ROOT / "hsnoise").rglob("*") if path.is_file()}
     package = {name for name in package if "__pycache__" not in name}
-    assert {"hsnoise/py.typed", "hsnoise/data/enhancer_canon_5d3.eqx"} <= package
+    assert {"hsnoise/py.typed", "hsnoise/data/enhancer_canon_5d3.eqx", "hsnoise/data/st8/README.txt"} <= package
+    assert len([name for name in package if name.endswith(".fits.fz")]) == 18
     about = f"hsnoise-{PROJECT['version']}.dist-info/"
     assert {name for name in names if not name.startswith(about)} == package
     assert f"{about}licenses/LICENSE" in names
@@ -105,6 +108,39 @@ print(folder, hsnoise.__version__)
 """
     folder, version = run(installed / "python", "-c", code, cwd=tmp_path).split()
     assert Path(folder).is_relative_to(installed.parent) and version == PROJECT["version"]
+
+
+@pytest.mark.slow
+def test_a_folder_of_fits_files_is_fitted_in_three_commands(installed, tmp_path):
+    """Installing is the first; the capture is the one that comes with the package."""
+    run(installed / "python", "-c", "import hsnoise; hsnoise.examples.st8('night')", cwd=tmp_path)
+    assert "18 frames of 240 rows x 320 columns" in run(installed / "hsnoise", "inspect", "night", cwd=tmp_path)
+    run(installed / "hsnoise", "fit", "night", "--out", "fit", cwd=tmp_path)
+    table = (tmp_path / "fit" / "table.csv").read_text().splitlines()
+    (gain,) = [line for line in table if line.startswith("gain,")]
+    assert 2.65 < 1 / float(gain.split(",")[1]) < 2.73  # e-/DN; the header says 2.62
+
+
+@pytest.mark.slow
+def test_the_readme_runs_from_the_wheel(installed, tmp_path):
+    """Each command and each line of Python of the README, in order, where only the wheel is installed."""
+    run(installed / "python", "-m", "pip", "install", "-q", "av", cwd=tmp_path)  # the extra for video
+    made = "import hsnoise, shutil; hsnoise.examples.st8('night'); shutil.copytree('night', 'darks'); shutil.move('darks/flat3s', 'flats')"
+    scene = "; from skimage import data, io; io.imsave('scene.png', data.astronaut()[:192, :256])"
+    run(installed / "python", "-c", made + scene, cwd=tmp_path)
+    little = {"improve": ["--max-steps", "0"], "demo": ["--max-steps", "0"]}
+    ran = 0
+    for language, block in re.findall(r"^```(python|sh)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.M | re.S):
+        if language == "python":
+            run(installed / "python", "-c", f"import numpy as np\n{block}", cwd=tmp_path)
+            ran += 1
+            continue
+        for line in block.splitlines():
+            program, *words = shlex.split(line, comments=True) or [""]
+            if program == "hsnoise":
+                run(installed / "hsnoise", *words, *little.get(words[0], []), cwd=tmp_path)
+                ran += 1
+    assert ran >= 10
 
 
 @pytest.mark.slow
