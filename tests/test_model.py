@@ -362,12 +362,12 @@ def test_a_value_that_a_parameter_cannot_have_is_refused(name, field, value, err
 
 
 @pytest.mark.parametrize(
-    "key", [0, "0", np.zeros(2), jax.random.split(jax.random.key(0), 3)], ids=["number", "text", "floats", "several"]
+    "key", [0.0, "0", np.zeros(2), jax.random.split(jax.random.key(0), 3)], ids=["float", "text", "floats", "several"]
 )
 @pytest.mark.parametrize("name", ["key", "sensor_key"])
 def test_what_is_no_random_key_is_named(name, key):
     keys = {"key": jax.random.key(0), "sensor_key": jax.random.key(1), name: key}
-    with pytest.raises(TypeError, match=f"^{name}: expected one random key"):
+    with pytest.raises(TypeError, match=f"^{name}: expected a whole number from 0 to 4294967295 or one random key"):
         sample(keys["key"], np.zeros((1, 4, 4)), canon_5d3(), sensor_key=keys["sensor_key"])
 
 
