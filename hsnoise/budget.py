@@ -10,6 +10,7 @@ import numpy as np
 
 from hsnoise._arguments import callback
 from hsnoise._budget_table import printed
+from hsnoise._source import as_stack
 from hsnoise.decomposition import COMPONENTS, Component, mean_of
 from hsnoise.draws import check_fits, draw_capture, middle_of
 from hsnoise.model import NoiseModel
@@ -17,7 +18,7 @@ from hsnoise.pixels.classes import levels_of, slope_over
 from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
 from hsnoise.pixels.sample import covariance_of
 from hsnoise.pixels.survey import Group, Survey, survey
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 
 TOP_SHARE, FEWEST_TOP = 1e-3, 10  # of the pixels, that are the tail
 
@@ -146,8 +147,9 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
     sensors above 2 Mpixel, or 1 Mpixel where there are more than two exposures.
 
     Args:
-        stack: FrameStack, or with FrameStack's keywords an array [frame, row, column] or [exposure, frame, row,
-            column], or a list of arrays [frame, row, column].
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or with FrameStack's
+            keywords an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays [frame, row,
+            column].
         progress: called with no argument after each frame.
 
     Returns:
@@ -155,7 +157,7 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
         exposure of one frame all are NaN: what stays and what changes cannot be told apart.
 
     Raises:
-        TypeError, ValueError: whatever `FrameStack` refuses.
+        FileNotFoundError, TypeError, ValueError: whatever `load` or `FrameStack` refuse.
 
     Reference: D'Agostino and Webb, SPIE 1488, 1991.
     """

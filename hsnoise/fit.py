@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
+from hsnoise._source import as_stack
 from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.doubts import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.draws import check_effects, check_fits, part_of
@@ -27,7 +28,6 @@ from hsnoise.pixels.structure import can_be_transferred, pixels_differ
 from hsnoise.pixels.survey import Survey, survey
 from hsnoise.profile import profile_errors
 from hsnoise.result import NOT_CONVERGED, FitResult
-from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
 
@@ -66,9 +66,10 @@ def fit(
     in the exact likelihood. A test on the frames decides.
 
     Args:
-        stack: FrameStack, a `Summary` of one, or with FrameStack's keywords (exposure_s, black_level, white_level, cfa,
-            shutter, kind, ...) an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays
-            [frame, row, column], one an exposure.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack, or a `Summary` of one; or
+            with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...) an array
+            [frame, row, column] or [exposure, frame, row, column], or a list of arrays [frame, row, column], one an
+            exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
             not used, but for `row_gain.white_share`: 0 and 1 are held, and any other is where the search for it starts.
             Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
@@ -83,7 +84,8 @@ def fit(
         FitResult: `print` it for the table; `params` goes to `hsnoise.sample`.
 
     Raises:
-        ValueError: for bad input, before any long work, and for effects that cannot be fitted.
+        FileNotFoundError, TypeError, ValueError: for bad input, before any long work; ValueError for effects that
+            cannot be fitted.
         RuntimeError: if method="ml" does not converge.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019; the

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -322,28 +320,3 @@ def _flats_elsewhere(elsewhere: Any, cfa: str) -> FrameStack | None:
             f" channels {elsewhere.channels}{' and more elsewhere' if elsewhere.elsewhere is not None else ''}"
         )
     return elsewhere
-
-
-def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
-    """A `FrameStack` as it is, or one made of a bare array with the keywords of `FrameStack`.
-
-    Raises:
-        TypeError: keywords beside a `FrameStack`, which holds them already, or that it does not know; or a path.
-    """
-    known = [name for name in inspect.signature(FrameStack).parameters if name != "counts"]
-    unknown = [name for name in keywords if name not in known]
-    if unknown:
-        raise TypeError(f"{', '.join(unknown)}: expected keywords among {', '.join(known)}")
-    if isinstance(array_or_stack, FrameStack):
-        if keywords:
-            raise TypeError(
-                f"{', '.join(keywords)}: only go with a bare array of counts; a FrameStack holds them already"
-            )
-        return array_or_stack
-    if isinstance(array_or_stack, str | PathLike):
-        raise TypeError(
-            f"expected a FrameStack or an array of counts, got the path {array_or_stack!r}; hsnoise.load reads files"
-        )
-    if not hasattr(array_or_stack, "__len__") and not hasattr(array_or_stack, "shape"):
-        raise TypeError(f"stack: expected a FrameStack or an array of counts, got {type(array_or_stack).__name__}")
-    return FrameStack(array_or_stack, **keywords)

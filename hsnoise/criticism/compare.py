@@ -11,13 +11,14 @@ from rich.table import Table
 
 from hsnoise._arguments import callback, seed_of, whole_number
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._source import as_stack
 from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.result import number
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 from hsnoise.structure import explained
 
 DRAWS = 40
@@ -104,12 +105,14 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
 
     Args:
         params: any NoiseModel, fitted or from a file.
-        stack: FrameStack, or a bare array with FrameStack's keywords.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+            FrameStack's keywords.
         draws: captures that are drawn from the model as yardstick.
         seed: of the draws; progress: called with no argument after each.
 
     Raises:
-        TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
+        FileNotFoundError, TypeError, ValueError: what `load` or `FrameStack` refuse; model and stack do not fit
+            together, no darks, fewer than 8 draws.
     """
     draws, seed = whole_number("draws", draws, 8), seed_of("seed", seed)
     tick = callback("progress", progress)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback, counter, seed_of, whole_number
+from hsnoise._source import as_stack
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
@@ -21,7 +22,7 @@ from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, S
 from hsnoise.fit import WITH_LIKELIHOOD, fit, rechecked
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult, number, rounded
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 from hsnoise.synthetic import fit_synthetic
 
 MOST_STEPS = 8
@@ -54,7 +55,8 @@ def improve(
     story goes on; it is told as finished only if nothing significant is left.
 
     Args:
-        stack: FrameStack, or a bare array with FrameStack's keywords.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+            FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
         max_minutes: after which no further effect is looked for; None: as long as it takes.
@@ -64,7 +66,7 @@ def improve(
             that nothing is lost.
 
     Raises:
-        TypeError, ValueError: bad input, before any long work.
+        FileNotFoundError, TypeError, ValueError: bad input, before any long work.
     """
     say, keep, seed = callback("progress", progress), callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from hsnoise._arguments import callback
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._source import as_stack
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.decomposition import COMPONENTS, Component
 from hsnoise.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.inspection._odd import odd_frames
 from hsnoise.inspection._verdict import about_growth, judged
-from hsnoise.io import load
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 
 MOST_ROWS = 12  # of the printed budget
 FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is named
@@ -86,8 +85,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
             are named instead.
     """
     tick = callback("progress", progress)
-    is_path = isinstance(path_or_stack, str | PathLike) or _are_paths(path_or_stack)
-    stack = load(path_or_stack, **keywords) if is_path else as_stack(path_or_stack, **keywords)
+    stack = as_stack(path_or_stack, **keywords)
     facts = facts_of(stack, tick)
     elsewhere = None if stack.elsewhere is None else facts_of(stack.elsewhere, tick)
     main_budget, other_budget = _budget(facts), _budget(elsewhere)
@@ -120,10 +118,6 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         next_capture=found.next_capture,
         budget=main_budget,
     )
-
-
-def _are_paths(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(one, str | PathLike) for one in value)
 
 
 def _budget(facts: Facts | None) -> NoiseBudget | None:
