@@ -36,7 +36,7 @@ class NoiseModel(eqx.Module):
     """What a sensor does to light: effects in the order of their stages, then of insertion.
 
     A PyTree whose leaves are the physical parameters. `model["gain"].value` is the gain, `model.add(effect)`
-    a larger model, `model.table()` all numbers with their units.
+    a larger model, `model.table` all numbers with their units.
 
     Attributes:
         effects: the effects, in the order in which they act.
@@ -140,9 +140,11 @@ class NoiseModel(eqx.Module):
         """All numbers of the model with name, value, unit, bounds and meaning."""
         return [parameter for effect in self.effects for parameter in effect.parameters(self.channels)]
 
-    def table(self) -> dict[str, tuple[float, str]]:
-        """Parameter name to (value, unit), such as {"gain.R": (1.53, "DN/e-"), ...}."""
-        return {p.name: (p.value, p.spec.unit) for p in self.parameters()}
+    @property
+    def table(self) -> dict[str, tuple[float, float, str]]:
+        """Parameter name to (value, standard error, unit) as in the table of a fit, such as {"gain.R": (1.53, nan,
+        "DN/e-"), ...}; the error is NaN throughout: a model states none."""
+        return {p.name: (p.value, math.nan, p.spec.unit) for p in self.parameters()}
 
     def save(self, path: str | os.PathLike, *, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model as human-readable JSON, all or nothing.

@@ -113,7 +113,7 @@ class FitResult:
         and infinite where the capture says nothing."""
         fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
         rows_ = {}
-        for name, (value, unit) in self.params.table().items():
+        for name, (value, _, unit) in self.params.table.items():
             if name in self.withheld:
                 rows_[name] = (float("nan"), float("inf"), unit)
                 continue
@@ -131,7 +131,7 @@ class FitResult:
         params = self.params
         for name in names:
             params = params.remove(name)
-        table = params.table()
+        table = params.table
         kept = [i for i, name in enumerate(self.names) if name in table]
         return replace(
             self,
