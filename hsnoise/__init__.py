@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import Any
 
@@ -43,8 +44,16 @@ __all__ = [
     "summarise",
 ]
 
+# What is going on goes to the loggers below "hsnoise": stages as INFO, details as DEBUG. It is silent unless asked for.
+logging.getLogger("hsnoise").addHandler(logging.NullHandler())
+
 
 def __getattr__(name: str) -> Any:
     if name == "plots":  # brings matplotlib, which is slow to import
         return import_module("hsnoise.plots")
     raise AttributeError(f"module 'hsnoise' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Public names alone, for completion."""
+    return sorted([*__all__, "__version__", "plots"])

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hsnoise._arguments import callback
-from hsnoise._budget_table import printed
+from hsnoise._budget_table import as_html, printed
+from hsnoise._pandas import data_frame
 from hsnoise._source import as_stack
 from hsnoise.decomposition import COMPONENTS, Component, mean_of
 from hsnoise.draws import check_fits, draw_capture, middle_of
@@ -102,12 +103,11 @@ class NoiseBudget:
         )
 
     def to_pandas(self) -> Any:
-        """`table` as a pandas DataFrame (needs pandas: pip install 'hsnoise[pandas]')."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("NoiseBudget.to_pandas: needs pandas: pip install 'hsnoise[pandas]'") from error
-        return pandas.DataFrame(self.table, columns=TableRow._fields)
+        """`table` as a pandas DataFrame, its columns the fields of `TableRow` (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return data_frame(self, TableRow._fields, self.table)
 
     def under(self, model: NoiseModel) -> NoiseBudget:
         """The budget of a capture drawn from `model` as this one was taken; of large frames the middle is drawn.
@@ -128,6 +128,9 @@ class NoiseBudget:
         return printed(self)
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
 
     def sentences(self) -> list[str]:
         """Pixels that are stuck, dead, hot, or telegraph-like."""

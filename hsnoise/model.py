@@ -19,10 +19,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from hsnoise import _html
 from hsnoise._arguments import checked_exposure, checked_light, listed, piece_of, whole_number
 from hsnoise._effect_json import effect_from_json, effect_to_json
 from hsnoise._keys import key_of, named_key
 from hsnoise._output import write_atomically
+from hsnoise._pandas import table_to_pandas
 from hsnoise._poisson import Regime, regime_of
 from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
 from hsnoise.arrivals import merged
@@ -124,17 +126,30 @@ class NoiseModel(eqx.Module):
         return NoiseModel(effects, cfa=self.cfa, shutter=self.shutter, exposure_s=self.exposure_s)
 
     def __repr__(self) -> str:
-        head = f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
-        lines = [head]
+        rows = (f"  {name} = {value} {unit}".rstrip() for name, value, unit in self._shown())
+        return "\n".join([self._title, *rows])
+
+    def _repr_html_(self) -> str:
+        rows = self._shown()
+        table = _html.table(("parameter", "value", "unit"), rows, words=("parameter", "unit")) if rows else ""
+        return _html.fragment(_html.paragraph(self._title), table)
+
+    @property
+    def _title(self) -> str:
+        return f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
+
+    def _shown(self) -> list[tuple[str, str, str]]:
+        """Names, values and units of parameters and of what was chosen; none of a model without numbers."""
+        rows = []
         for effect in self.effects:
             try:
                 parameters = effect.parameters(self.channels)
             except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
-                return head
-            lines += [f"  {p.name} = {p.value:.6g} {unit_in_words(p.spec.unit)}".rstrip() for p in parameters]
+                return []
+            rows += [(p.name, f"{p.value:.6g}", unit_in_words(p.spec.unit)) for p in parameters]
             chosen = effect.settings().items()
-            lines += [f"  {effect.name}.{field} = {value}" for field, value in chosen if value is not None]
-        return "\n".join(lines)
+            rows += [(f"{effect.name}.{field}", f"{value}", "") for field, value in chosen if value is not None]
+        return rows
 
     def parameters(self) -> list[Parameter]:
         """All numbers of the model with name, value, unit, bounds and meaning."""
@@ -145,6 +160,13 @@ class NoiseModel(eqx.Module):
         """Parameter name to (value, standard error, unit) as in the table of a fit, such as {"gain.R": (1.53, nan,
         "DN/e-"), ...}; the error is NaN throughout: a model states none."""
         return {p.name: (p.value, math.nan, p.spec.unit) for p in self.parameters()}
+
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame: parameter, value, standard_error, unit (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return table_to_pandas(self)
 
     def save(self, path: str | os.PathLike, *, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model as human-readable JSON, all or nothing.

@@ -26,9 +26,10 @@ from hsnoise._arguments import (
     whole_number,
     window_of,
 )
-from hsnoise._describing import described
+from hsnoise._describing import COLUMNS, as_html, described, groups_of
 from hsnoise._frames import check_black_level, crop, read_mapped, shift_cfa, transpose_cfa
 from hsnoise._joining import joined, replaced
+from hsnoise._pandas import data_frame
 from hsnoise._reading import check_frame, checked, frame_name, in_sensor_orientation, is_dask, while_reading
 from hsnoise._types import BAYER_CFAS, SHUTTERS, StatedGain, Window, channels_of
 
@@ -305,8 +306,19 @@ class FrameStack:
         arguments = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {**arguments, "cfa": transpose_cfa(self.cfa) if self.row_axis == 1 else self.cfa}
 
+    def to_pandas(self) -> Any:
+        """The exposure groups as a pandas DataFrame: kind, exposure_s, frames, photons_e, temperature_c, overscan_dn,
+        NaN where unknown (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return data_frame(self, COLUMNS, groups_of(self))
+
     def __repr__(self) -> str:
         return described(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
 
 
 def _flats_elsewhere(elsewhere: Any, cfa: str) -> FrameStack | None:

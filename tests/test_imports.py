@@ -13,7 +13,7 @@ import hsnoise
 
 ROOT = Path(hsnoise.__file__).parent
 # A module may import those before it, and its own package.
-ORDER = """_conclusion _types _keys _threads _compiling _memory _numerics _poisson _coloured _frames
+ORDER = """_conclusion _html _pandas _types _keys _threads _compiling _memory _numerics _poisson _coloured _frames
     _reading _describing _joining _arguments _output stack io _source effects _effect_json arrivals signal_chain
     stlstm weights video model mosaic cameras photometry _counting flat_pairs flats flat_gain narrow_noise
     statistics structure draws decomposition pixels rows flat_likelihood physics moments plan likelihood

@@ -8,6 +8,7 @@ systems", Nature 466, 2010), and a verdict is given only if the winner also expl
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -41,6 +42,8 @@ from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
+
+log = logging.getLogger(__name__)
 
 DRAWS = 64
 GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
@@ -104,12 +107,17 @@ def diagnose(
     for maker in own.values():
         check_effects(model.add(made(maker, 1.0, 0)), part)
     makers = {name: maker for name, maker in built_in(model, part).items() if name not in own}
+    log.info(
+        "Drawing %d captures from the model, and each of %d candidates on top of it", draws, len(makers) + len(own)
+    )
     bench = Bench(model, part, reference(model, part, draws, seed, tick), seed, tick)
     slopes = bench.slopes()
     null = shrunk(bench.base.own_z(), slopes)
     z = bench.base.z(measure(part, model).values)
     evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
+    log.info("Most likely at first: %s", _scores(judged[:WORST]))
+    log.debug("All candidates: %s", _scores(judged))
     pair = None
     if EVIDENCE < judged[0].score < SURE:
         evidence = replace(evidence, limit=_limit(judged, draws, bench, evidence))
@@ -132,12 +140,18 @@ def diagnose(
             found = _verdict(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, laws)
             if found.best is candidate:
                 found = replace(found, unexplained=_what_remains(left, law))
+    log.info("Diagnosis: %s", found.conclusion)
+    log.debug("%s", found)
     if found.verdict != "unexplained":
         return found
     prints = [one.of for one in judged]
     return replace(
         found, nearest=nearest(prints, found.ranking, evidence, slopes, np.diagonal(bench.base.law.covariance))
     )
+
+
+def _scores(judged: Iterable[Judged]) -> str:
+    return ", ".join(f"{one.of.name} {one.score:.1f} nats" for one in judged)
 
 
 def _limit(judged: list[Judged], draws: int, bench: Bench, evidence: Evidence) -> float:
