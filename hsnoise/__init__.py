@@ -6,7 +6,7 @@ import logging
 from importlib import import_module
 from typing import Any
 
-from hsnoise import cameras
+from hsnoise import cameras, effects
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
@@ -32,6 +32,7 @@ __all__ = [
     "cameras",
     "compare",
     "diagnose",
+    "effects",
     "fit",
     "improve",
     "inspect",

@@ -75,7 +75,7 @@ import sys, jax
 before = dict(jax.config.values)
 import hsnoise
 assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
-heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2"} & set(sys.modules)
+heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2", "pandas"} & set(sys.modules)
 assert not heavy, heavy
 assert set(hsnoise.__all__) <= set(dir(hsnoise))
 import hsnoise.cli
@@ -83,3 +83,11 @@ heavy = {"matplotlib", "optax", "skimage", "av"} & set(sys.modules)
 assert not heavy, heavy
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_completion_shows_public_names_only():
+    names = dir(hsnoise)
+    assert set(names) == {*hsnoise.__all__, "__version__", "plots"} and len(names) == len(set(names))
+    assert all(getattr(hsnoise, name) is not None for name in names)
+    assert {"fit", "load", "sample", "improve", "cameras", "effects"} <= set(names)
+    assert not {"np", "jax", "Any", "annotations", "import_module", "logging", "io", "model"} & set(names)
