@@ -45,7 +45,7 @@ def capture(model: hsnoise.NoiseModel, seed: int) -> hsnoise.FrameStack:
 def one_seed(model: hsnoise.NoiseModel, seed: int) -> dict:
     """Errors (estimate minus truth) and standard errors of both methods, and the information of the likelihood."""
     summary = hsnoise.summarise(capture(model, seed))
-    truth = {name: value for name, (value, _) in model.table().items()}
+    truth = {name: value for name, (value, _, _) in model.table.items()}
     record = {}
     for method in ("ml", "line"):
         result = fit(summary, method=method)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import Any
 
-from hsnoise import cameras, examples
+from hsnoise import cameras, effects, examples
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param
@@ -31,6 +32,7 @@ __all__ = [
     "cameras",
     "compare",
     "diagnose",
+    "effects",
     "examples",
     "fit",
     "improve",
@@ -44,8 +46,16 @@ __all__ = [
     "summarise",
 ]
 
+# What is going on goes to the loggers below "hsnoise": stages as INFO, details as DEBUG. It is silent unless asked for.
+logging.getLogger("hsnoise").addHandler(logging.NullHandler())
+
 
 def __getattr__(name: str) -> Any:
     if name == "plots":  # brings matplotlib, which is slow to import
         return import_module("hsnoise.plots")
     raise AttributeError(f"module 'hsnoise' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Public names alone, for completion."""
+    return sorted([*__all__, "__version__", "plots"])

@@ -134,15 +134,6 @@ def looks_like_a_mosaic(frame: np.ndarray) -> bool:
     return False
 
 
-def check_key(name: str, key: Any) -> None:
-    """Raise TypeError unless `key` is one random key, of the new style or the old."""
-    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
-    new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
-    if not (new or (dtype == np.uint32 and shape is not None and len(shape) == 1)):
-        came = repr(key) if dtype is None else f"an array of {dtype} of shape {shape}"
-        raise TypeError(f"{name}: expected one random key, such as jax.random.key(0), got {came}")
-
-
 def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
     """Four numbers that say where frames of `shape` lie on a sensor. Raises ValueError if they lie outside."""
     if window is None:

@@ -10,10 +10,17 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise import _html
 from hsnoise._types import seconds
 from hsnoise.decomposition import COMPONENTS, Component
 
 HEADINGS = {"row_x_frame": "row x\nframe", "column_x_frame": "column\nx frame"}
+ABOUT = (
+    "Noise budget: variances in DN², in brackets the standard error of the last digit. Row, column and\n"
+    "pixel stay as they are from frame to frame, the others change."
+)
+ABOUT_SHARES = "Their share of the total in per cent; σ is the root of the total"
+ABOUT_PIXELS = "How pixels differ, noise of estimation taken off"
 WIDTH = 100
 CLEAR = 2.0  # standard errors; below it a variance is given as an upper limit
 SMALL, LARGE = 1e-3, 1e4  # beyond which powers of ten are shorter
@@ -22,20 +29,29 @@ SMALL, LARGE = 1e-3, 1e4  # beyond which powers of ten are shorter
 def printed(budget: Any) -> str:
     """The whole budget, for `print`."""
     console = Console(file=io.StringIO(), width=WIDTH, color_system=None, highlight=False)
-    console.print(
-        "Noise budget: variances in DN², in brackets the standard error of the last digit. Row, column and\n"
-        "pixel stay as they are from frame to frame, the others change."
-    )
+    console.print(ABOUT)
     console.print(variances(budget))
-    console.print("Their share of the total in per cent; σ is the root of the total")
+    console.print(ABOUT_SHARES)
     console.print(shares(budget))
     if budget.pixels:
-        console.print("How pixels differ, noise of estimation taken off")
+        console.print(ABOUT_PIXELS)
         console.print(spreads(budget))
     for sentence in budget.sentences():
         console.print(f"- {sentence}")
     lines = (line.rstrip() for line in console.file.getvalue().rstrip().splitlines())
     return "\n".join(line for line in lines if line)
+
+
+def as_html(budget: Any) -> str:
+    """The same tables for a notebook, of shares first: they tell at a glance what matters."""
+    pixels = [_html.paragraph(ABOUT_PIXELS), _html.printed(spreads(budget))] if budget.pixels else []
+    return _html.fragment(
+        _html.paragraph("Noise budget: shares of the total variance in per cent; σ is the root of the total"),
+        _html.printed(shares(budget)),
+        _html.sentences(budget.sentences()),
+        _html.details("Variances", _html.paragraph(ABOUT.replace("\n", " ")), _html.printed(variances(budget))),
+        _html.details("Pixels", *pixels),
+    )
 
 
 def variances(budget: Any) -> Table:

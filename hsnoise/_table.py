@@ -18,7 +18,7 @@ def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
     for name in ("value", "standard error"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("unit")
-    true_values = {} if truth is None else truth.table()
+    true_values = {} if truth is None else truth.table
     if truth is not None:
         table.add_column("truth", justify="right", no_wrap=True)
         table.add_column("off by", justify="right", no_wrap=True)

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hsnoise._arguments import callback
-from hsnoise._budget_table import printed
+from hsnoise._budget_table import as_html, printed
+from hsnoise._pandas import data_frame
+from hsnoise._source import as_stack
 from hsnoise.decomposition import COMPONENTS, Component, mean_of
 from hsnoise.draws import check_fits, draw_capture, middle_of
 from hsnoise.model import NoiseModel
@@ -17,7 +19,7 @@ from hsnoise.pixels.classes import levels_of, slope_over
 from hsnoise.pixels.flags import FLAGS, counts_of, flags_of
 from hsnoise.pixels.sample import covariance_of
 from hsnoise.pixels.survey import Group, Survey, survey
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 
 TOP_SHARE, FEWEST_TOP = 1e-3, 10  # of the pixels, that are the tail
 
@@ -101,12 +103,11 @@ class NoiseBudget:
         )
 
     def to_pandas(self) -> Any:
-        """`table` as a pandas DataFrame (needs pandas: pip install 'hsnoise[pandas]')."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("NoiseBudget.to_pandas: needs pandas: pip install 'hsnoise[pandas]'") from error
-        return pandas.DataFrame(self.table, columns=TableRow._fields)
+        """`table` as a pandas DataFrame, its columns the fields of `TableRow` (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return data_frame(self, TableRow._fields, self.table)
 
     def under(self, model: NoiseModel) -> NoiseBudget:
         """The budget of a capture drawn from `model` as this one was taken; of large frames the middle is drawn.
@@ -128,6 +129,9 @@ class NoiseBudget:
 
     __repr__ = __str__
 
+    def _repr_html_(self) -> str:
+        return as_html(self)
+
     def sentences(self) -> list[str]:
         """Pixels that are stuck, dead, hot, or telegraph-like."""
         said = []
@@ -146,8 +150,9 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
     sensors above 2 Mpixel, or 1 Mpixel where there are more than two exposures.
 
     Args:
-        stack: FrameStack, or with FrameStack's keywords an array [frame, row, column] or [exposure, frame, row,
-            column], or a list of arrays [frame, row, column].
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or with FrameStack's
+            keywords an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays [frame, row,
+            column].
         progress: called with no argument after each frame.
 
     Returns:
@@ -155,7 +160,7 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
         exposure of one frame all are NaN: what stays and what changes cannot be told apart.
 
     Raises:
-        TypeError, ValueError: whatever `FrameStack` refuses.
+        FileNotFoundError, TypeError, ValueError: whatever `load` or `FrameStack` refuse.
 
     Reference: D'Agostino and Webb, SPIE 1488, 1991.
     """

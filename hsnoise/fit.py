@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
+from hsnoise._source import as_stack
 from hsnoise.coordinates import coordinates_for, labels
 from hsnoise.doubts import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.draws import check_effects, check_fits, part_of
@@ -27,9 +29,10 @@ from hsnoise.pixels.structure import can_be_transferred, pixels_differ
 from hsnoise.pixels.survey import Survey, survey
 from hsnoise.profile import profile_errors
 from hsnoise.result import NOT_CONVERGED, FitResult
-from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, far_outliers, summarise
 from hsnoise.synthetic import fit_synthetic
+
+log = logging.getLogger(__name__)
 
 OUTLIERS_FROM = 1e-4
 PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, that tell whether pixels differ
@@ -65,9 +68,10 @@ def fit(
     in the exact likelihood. A test on the frames decides.
 
     Args:
-        stack: FrameStack, a `Summary` of one, or with FrameStack's keywords (exposure_s, black_level, white_level, cfa,
-            shutter, kind, ...) an array [frame, row, column] or [exposure, frame, row, column], or a list of arrays
-            [frame, row, column], one an exposure.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack, or a `Summary` of one; or
+            with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...) an array
+            [frame, row, column] or [exposure, frame, row, column], or a list of arrays [frame, row, column], one an
+            exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
             not used, but for `row_gain.white_share`: 0 and 1 are held, and any other is where the search for it starts.
             Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
@@ -82,7 +86,8 @@ def fit(
         FitResult: `print` it for the table; `params` goes to `hsnoise.sample`.
 
     Raises:
-        ValueError: for bad input, before any long work, and for effects that cannot be fitted.
+        FileNotFoundError, TypeError, ValueError: for bad input, before any long work; ValueError for effects that
+            cannot be fitted.
         RuntimeError: if method="ml" does not converge.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019; the
@@ -106,17 +111,24 @@ def fit(
     simulated = tuple(name for name in extra if not (differ and name in POPULATION))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
-        return result if found is None else checked(result, Evidence(found, result.summary))
+        return _ended(result if found is None else checked(result, Evidence(found, result.summary)))
     if model is not None:
         _check_complete(model)
     summary = source if isinstance(source, Summary) else _summary_of(source, progress)
     if found is None:
-        return _pooled(summary, model, method)
+        return _ended(_pooled(summary, model, method))
     seen = Evidence(found, summary)
     if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
-        return checked(result_of(measure(_all_of(source, found), summary), summary, model, source), seen)
+        log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they tell no gain")
+        return _ended(checked(result_of(measure(_all_of(source, found), summary), summary, model, source), seen))
     result = replace(_pooled(summary, model, method), stack=source)
-    return checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen)
+    return _ended(checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen))
+
+
+def _ended(result: FitResult) -> FitResult:
+    log.info("Fit: %s", result.conclusion)
+    log.debug("%s", result)
+    return result
 
 
 def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:
@@ -142,6 +154,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
             start = replace(start, white_share=white_share, exponent=exponent)
         if method == "line":
             return _by_line(summary, model, "the paper's line fit, as asked")
+        log.info("Maximising the likelihood of rows, pixels pooled")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
         outside = far_outliers(summary)
         result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
@@ -177,6 +190,7 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
     part = part_of(stack)
     check_effects(model, part)
+    log.info("Effects beyond the paper's, by simulated statistics after a fit of the others: %s", ", ".join(extra))
     bare = model
     for name in extra:
         bare = bare.remove(name)
@@ -226,6 +240,7 @@ def _check_size(stack) -> None:
 
 def _summary_of(stack, progress) -> Summary:
     _check_size(stack)
+    log.info("Reading %d frames of %d x %d pixels", sum(stack.n_frames), *stack.shape)
     if stack.cfa == "mono":
         warn_of_a_mosaic(stack.frame(int(np.argmax(stack.exposure_s)), 0))
     summary = summarise(stack, progress)
@@ -264,8 +279,10 @@ def _check_clamp(summary: Summary, method: str) -> None:
 
 
 def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, bool]:
+    log.debug("Start of the likelihood: %s", start)
     coordinates = coordinates_for(summary, start)
     maximum = maximise(coordinates, summary)
+    log.info("Maximum likelihood, %d iterations: %s", maximum.iterations, maximum.outcome)
     names = labels(coordinates, summary.channels)
     covariance = _covariance(maximum.information)
     if maximum.converged:
@@ -326,6 +343,7 @@ def _of_hidden_dark_level(covariance: np.ndarray, names, physics: Physics, summa
 
 
 def _by_line(summary: Summary, model, outcome: str) -> FitResult:
+    log.info("Line fit: %s", outcome)
     line = line_fit(summary)
     coordinates = coordinates_for(summary, line.physics)
     errors = np.asarray(coordinates.flat(jax.tree.map(jnp.asarray, line.standard_errors)))

@@ -8,7 +8,6 @@ import jax
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Rules, evaluate, physics_of
 from hsnoise.plan import CLOSE_MARGIN, plan_rules
-from hsnoise.stack import as_stack
 from hsnoise.statistics import Summary, summarise, without_counts
 
 _evaluate = eqx.filter_jit(evaluate)
@@ -18,8 +17,7 @@ def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **k
     """Log-likelihood (nats) of dark frames, and of flats if there are any, under `params`.
 
     params: a NoiseModel; `jax.jit`, `jax.grad` and `jax.vmap` work over its leaves.
-    stack: a FrameStack, an array (with FrameStack's keywords), or the `Summary` that `summarise` made of it; make the
-        Summary once for many calls.
+    stack: what `summarise` takes, with its keywords, or the `Summary` that it made: make that once for many calls.
     Computed in float64 whatever JAX's global setting. Rows with a coloured gain (shutter "rolling") are integrated by
     the expectation-consistent approximation (rows.py), white rows exactly, all within 7.5 deviations of the row gain
     and, while the model is traced, near the estimates from moments: a model that is thousands of nats from the capture
@@ -27,7 +25,7 @@ def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **k
     (a dark current of a tenth or four times the capture's, say). Raises ValueError if the model's
     channels or shutter are not the stack's, or if it holds effects without a likelihood.
     """
-    summary = stack if isinstance(stack, Summary) else summarise(as_stack(stack, **keywords))
+    summary = stack if isinstance(stack, Summary) else summarise(stack, **keywords)
     if params.channels != summary.channels:
         raise ValueError(f"params: channels {params.channels}, but the stack has {summary.channels}")
     if params.shutter != summary.shutter:

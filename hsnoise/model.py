@@ -19,10 +19,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise._arguments import check_key, checked_exposure, checked_light, listed, piece_of, whole_number
+from hsnoise import _html
+from hsnoise._arguments import checked_exposure, checked_light, listed, piece_of, whole_number
 from hsnoise._effect_json import effect_from_json, effect_to_json
-from hsnoise._keys import named_key
+from hsnoise._keys import key_of, named_key
 from hsnoise._output import write_atomically
+from hsnoise._pandas import table_to_pandas
 from hsnoise._poisson import Regime, regime_of
 from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
 from hsnoise.arrivals import merged
@@ -36,7 +38,7 @@ class NoiseModel(eqx.Module):
     """What a sensor does to light: effects in the order of their stages, then of insertion.
 
     A PyTree whose leaves are the physical parameters. `model["gain"].value` is the gain, `model.add(effect)`
-    a larger model, `model.table()` all numbers with their units.
+    a larger model, `model.table` all numbers with their units.
 
     Attributes:
         effects: the effects, in the order in which they act.
@@ -124,25 +126,47 @@ class NoiseModel(eqx.Module):
         return NoiseModel(effects, cfa=self.cfa, shutter=self.shutter, exposure_s=self.exposure_s)
 
     def __repr__(self) -> str:
-        head = f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
-        lines = [head]
+        rows = (f"  {name} = {value} {unit}".rstrip() for name, value, unit in self._shown())
+        return "\n".join([self._title, *rows])
+
+    def _repr_html_(self) -> str:
+        rows = self._shown()
+        table = _html.table(("parameter", "value", "unit"), rows, words=("parameter", "unit")) if rows else ""
+        return _html.fragment(_html.paragraph(self._title), table)
+
+    @property
+    def _title(self) -> str:
+        return f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
+
+    def _shown(self) -> list[tuple[str, str, str]]:
+        """Names, values and units of parameters and of what was chosen; none of a model without numbers."""
+        rows = []
         for effect in self.effects:
             try:
                 parameters = effect.parameters(self.channels)
             except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
-                return head
-            lines += [f"  {p.name} = {p.value:.6g} {unit_in_words(p.spec.unit)}".rstrip() for p in parameters]
+                return []
+            rows += [(p.name, f"{p.value:.6g}", unit_in_words(p.spec.unit)) for p in parameters]
             chosen = effect.settings().items()
-            lines += [f"  {effect.name}.{field} = {value}" for field, value in chosen if value is not None]
-        return "\n".join(lines)
+            rows += [(f"{effect.name}.{field}", f"{value}", "") for field, value in chosen if value is not None]
+        return rows
 
     def parameters(self) -> list[Parameter]:
         """All numbers of the model with name, value, unit, bounds and meaning."""
         return [parameter for effect in self.effects for parameter in effect.parameters(self.channels)]
 
-    def table(self) -> dict[str, tuple[float, str]]:
-        """Parameter name to (value, unit), such as {"gain.R": (1.53, "DN/e-"), ...}."""
-        return {p.name: (p.value, p.spec.unit) for p in self.parameters()}
+    @property
+    def table(self) -> dict[str, tuple[float, float, str]]:
+        """Parameter name to (value, standard error, unit) as in the table of a fit, such as {"gain.R": (1.53, nan,
+        "DN/e-"), ...}; the error is NaN throughout: a model states none."""
+        return {p.name: (p.value, math.nan, p.spec.unit) for p in self.parameters()}
+
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame: parameter, value, standard_error, unit (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return table_to_pandas(self)
 
     def save(self, path: str | os.PathLike, *, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model as human-readable JSON, all or nothing.
@@ -203,12 +227,12 @@ class NoiseModel(eqx.Module):
 
 
 def sample(
-    key: RandomKey,
+    key: RandomKey | int,
     clean: ArrayLike,
     params: NoiseModel,
     *,
     exposure_s: float | Scalar | None = None,
-    sensor_key: RandomKey | None = None,
+    sensor_key: RandomKey | int | None = None,
     window: tuple[Any, Any, int, int] | None = None,
     differentiable: bool = False,
 ) -> Array:
@@ -219,12 +243,12 @@ def sample(
     and vmap.
 
     Args:
-        key: random key.
+        key: a random key, or a whole number from 0 to 2^32 - 1, its seed: 7 stands for `jax.random.key(7)`.
         clean: expected photoelectrons of each pixel, e-, [..., row, column]; zeros give dark frames.
         params: the noise model.
         exposure_s: exposure in seconds; that of the model by default.
-        sensor_key: key from which fixed patterns are drawn; the same key is the same sensor. By default derived
-            from `key`, so that each call is another sensor of the same make.
+        sensor_key: key, or seed, from which fixed patterns are drawn; the same key is the same sensor. By default
+            derived from `key`, so that each call is another sensor of the same make.
         window: (first row, first column, rows, columns) where the frames are a piece of a larger sensor, for effects
             that depend on the place (glow, taps, shading); under jit the first two may be traced. Row gains and row
             noise run over the rows of the piece.
@@ -237,15 +261,16 @@ def sample(
         Without the `adc` effect (`params.remove("adc")`): DN as floats, neither rounded nor clipped.
 
     Raises:
-        TypeError: if `params` is no NoiseModel, `key` no random key, or `clean` does not hold real numbers.
+        TypeError: if `params` is no NoiseModel, a key is neither a random key nor a whole number, or `clean` does not
+            hold real numbers.
         ValueError: if `clean` has fewer than two dimensions, no pixels, odd sizes with a Bayer array, or
-            negative or non-finite values; if the exposure is negative or not one number; if the window does not
-            hold the frames. (Under jit, values cannot be checked.)
+            negative or non-finite values; if the exposure is negative or not one number; if a seed is out of range;
+            if the window does not hold the frames. (Under jit, values cannot be checked.)
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise",
     ICCV 2019.
     """
-    light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
+    key, light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key)
     capture = dataclasses.replace(capture, differentiable=differentiable)
     if window is not None:
         first, sensor = piece_of(window, capture.shape, params.cfa)
@@ -257,13 +282,13 @@ def sample(
 
 
 def sample_dark(
-    key: RandomKey,
+    key: RandomKey | int,
     n_frames: int,
     shape: tuple[int, int],
     params: NoiseModel,
     *,
     exposure_s: float | Scalar | None = None,
-    sensor_key: RandomKey | None = None,
+    sensor_key: RandomKey | int | None = None,
 ) -> Array:
     """Draw `n_frames` dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`.
 
@@ -291,7 +316,7 @@ def sample_by_effect(
     Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
     window: as in FrameStack, where the frames lie on a larger sensor.
     """
-    return apply_by_effect(key, *_prepared(key, clean, params, exposure_s, sensor_key, window))
+    return apply_by_effect(*_prepared(key, clean, params, exposure_s, sensor_key, window))
 
 
 def dark_signals(
@@ -299,20 +324,18 @@ def dark_signals(
 ) -> Iterator[tuple[AbstractEffect, Array]]:
     """What leaves each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
-    return signals(key, *_prepared(key, clean, params, exposure_s, None))
+    return signals(*_prepared(key, clean, params, exposure_s, None))
 
 
 def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
-    """Checked input: photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
+    """Checked input: key, photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
-    check_key("key", key)
-    if sensor_key is not None:
-        check_key("sensor_key", sensor_key)
+    key = key_of("key", key)
+    sensor_key = named_key(key, "sensor_key") if sensor_key is None else key_of("sensor_key", sensor_key)
     dtype = jnp.result_type(float)
     clean, low, high = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
-    sensor_key = named_key(key, "sensor_key") if sensor_key is None else sensor_key
     effects = merged(params.effects, _regime(low, high, params, exposure))
     # A fit returns float64 parameters, whatever precision the session samples in.
     numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
@@ -329,7 +352,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     )
     shape = (math.prod(clean.shape[:-2]), *capture.shape)
     light = jnp.asarray(low, dtype) if low == high else jnp.asarray(clean, dtype).reshape(shape)
-    return light, shape, effects, capture
+    return key, light, shape, effects, capture
 
 
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:

@@ -77,7 +77,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         )
         params = _model(wanted, physics, population, summary, pixel)
     names, covariance = _covariance(pixel, params, population, black[1], row)
-    withheld = () if pixel.determined else tuple(n for n in params.table() if _in_electrons(n))
+    withheld = () if pixel.determined else tuple(n for n in params.table if _in_electrons(n))
     errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
     unknown = [name for name, error in errors.items() if name.startswith("row_gain.sigma") and error > 1]
     if np.ptp(summary.exposure_s) == 0 and "dark_current" in params:
@@ -264,7 +264,7 @@ def _covariance(
     pixel: PixelFit, params: NoiseModel, population, black_error, row
 ) -> tuple[tuple[str, ...], np.ndarray]:
     """Names that were fitted and their covariance: gain, read noise, dark current together, others by themselves."""
-    table, channels = params.table(), params.channels
+    table, channels = params.table, params.channels
     suffix = [""] if channels == ("mono",) else [f".{c}" for c in channels]
     joint = [*(f"gain{s}" for s in suffix), "read_noise.sigma", "dark_current.rate"]
     errors: dict[str, float] = {}

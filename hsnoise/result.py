@@ -13,8 +13,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise import rows
+from hsnoise import _html, rows
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._pandas import table_to_pandas
 from hsnoise._types import unit_in_words
 from hsnoise.model import NoiseModel
 from hsnoise.physics import Physics, binning, dark_laws, log_probability
@@ -113,7 +114,7 @@ class FitResult:
         and infinite where the capture says nothing."""
         fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
         rows_ = {}
-        for name, (value, unit) in self.params.table().items():
+        for name, (value, _, unit) in self.params.table.items():
             if name in self.withheld:
                 rows_[name] = (float("nan"), float("inf"), unit)
                 continue
@@ -131,7 +132,7 @@ class FitResult:
         params = self.params
         for name in names:
             params = params.remove(name)
-        table = params.table()
+        table = params.table
         kept = [i for i, name in enumerate(self.names) if name in table]
         return replace(
             self,
@@ -162,27 +163,54 @@ class FitResult:
             )
             return [jax.tree.map(np.asarray, laws) for laws in found]
 
-    def __str__(self) -> str:
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame: parameter, value, standard_error, unit (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return table_to_pandas(self)
+
+    @property
+    def _title(self) -> str:
         exposures = len(self.summary.exposure_s)
         darks = f"{sum(self.summary.n_frames)} dark frames at {exposures} exposure{'s' if exposures != 1 else ''}"
         flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
-        title = TITLES[self.method]
+        return f"{TITLES[self.method]}: {darks}{flats}"
+
+    def _rounded_table(self) -> Table:
         table = Table()
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
         for name, (value, error, unit) in self.table.items():
             table.add_row(name, *rounded(value, error), unit_in_words(unit))
+        return table
+
+    def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(f"{title}: {darks}{flats}", highlight=False)
+        console.print(self._title, highlight=False)
         for doubt in self.doubts:
             console.print(f"! {doubt}", highlight=False)
-        console.print(table)
+        console.print(self._rounded_table())
         console.print(f"{self.outcome}; {self.iterations} iterations", highlight=False)
         for note in self.notes:
             console.print(f"- {note}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        conclusion = self.conclusion
+        return _html.fragment(
+            _html.conclusion(conclusion),
+            _html.sentences(doubt for doubt in self.doubts if doubt not in conclusion.sentence),
+            _html.paragraph(self._title),
+            _html.printed(self._rounded_table()),
+            _html.details(
+                f"How it ended, and {len(self.notes)} note{'s' if len(self.notes) != 1 else ''}",
+                _html.paragraph(f"{self.outcome}; {self.iterations} iterations"),
+                _html.sentences(self.notes),
+            ),
+        )
 
 
 @jax.jit

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -28,9 +26,10 @@ from hsnoise._arguments import (
     whole_number,
     window_of,
 )
-from hsnoise._describing import described
+from hsnoise._describing import COLUMNS, as_html, described, groups_of
 from hsnoise._frames import check_black_level, crop, read_mapped, shift_cfa, transpose_cfa
 from hsnoise._joining import joined, replaced
+from hsnoise._pandas import data_frame
 from hsnoise._reading import check_frame, checked, frame_name, in_sensor_orientation, is_dask, while_reading
 from hsnoise._types import BAYER_CFAS, SHUTTERS, StatedGain, Window, channels_of
 
@@ -307,8 +306,19 @@ class FrameStack:
         arguments = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {**arguments, "cfa": transpose_cfa(self.cfa) if self.row_axis == 1 else self.cfa}
 
+    def to_pandas(self) -> Any:
+        """The exposure groups as a pandas DataFrame: kind, exposure_s, frames, photons_e, temperature_c, overscan_dn,
+        NaN where unknown (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return data_frame(self, COLUMNS, groups_of(self))
+
     def __repr__(self) -> str:
         return described(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
 
 
 def _flats_elsewhere(elsewhere: Any, cfa: str) -> FrameStack | None:
@@ -322,28 +332,3 @@ def _flats_elsewhere(elsewhere: Any, cfa: str) -> FrameStack | None:
             f" channels {elsewhere.channels}{' and more elsewhere' if elsewhere.elsewhere is not None else ''}"
         )
     return elsewhere
-
-
-def as_stack(array_or_stack: Any, **keywords: Any) -> FrameStack:
-    """A `FrameStack` as it is, or one made of a bare array with the keywords of `FrameStack`.
-
-    Raises:
-        TypeError: keywords beside a `FrameStack`, which holds them already, or that it does not know; or a path.
-    """
-    known = [name for name in inspect.signature(FrameStack).parameters if name != "counts"]
-    unknown = [name for name in keywords if name not in known]
-    if unknown:
-        raise TypeError(f"{', '.join(unknown)}: expected keywords among {', '.join(known)}")
-    if isinstance(array_or_stack, FrameStack):
-        if keywords:
-            raise TypeError(
-                f"{', '.join(keywords)}: only go with a bare array of counts; a FrameStack holds them already"
-            )
-        return array_or_stack
-    if isinstance(array_or_stack, str | PathLike):
-        raise TypeError(
-            f"expected a FrameStack or an array of counts, got the path {array_or_stack!r}; hsnoise.load reads files"
-        )
-    if not hasattr(array_or_stack, "__len__") and not hasattr(array_or_stack, "shape"):
-        raise TypeError(f"stack: expected a FrameStack or an array of counts, got {type(array_or_stack).__name__}")
-    return FrameStack(array_or_stack, **keywords)

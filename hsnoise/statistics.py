@@ -18,6 +18,7 @@ import numpy as np
 from hsnoise._arguments import callback
 from hsnoise._counting import Bins, count_rows
 from hsnoise._frames import channel_planes, channel_rows
+from hsnoise._source import as_stack
 from hsnoise._types import cfa_tile, channels_of
 from hsnoise.flats import FlatMoments, flat_moments
 from hsnoise.stack import FrameStack
@@ -135,14 +136,17 @@ def coding_of(stack: FrameStack) -> Coding:
     return [_codings(stack, i) for i, kind in enumerate(stack.kind) if kind == "dark"]
 
 
-def summarise(stack: FrameStack, progress=None, coding: Coding | None = None) -> Summary:
+def summarise(stack, progress=None, coding: Coding | None = None, **keywords) -> Summary:
     """One pass over the pixels of `stack`: its row histograms (darks) and photon transfer (flats).
 
+    stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+        FrameStack's keywords.
     progress: called with no argument after each frame. coding: bins of another stack, to compare with it.
-    Raises ValueError for frames that cannot be measured (NaN, constant, all zero, saturated) and where nothing is left
-    to fit.
+    Raises what `load` and `FrameStack` refuse, and ValueError for frames that cannot be measured (NaN, constant, all
+    zero, saturated) and where nothing is left to fit.
     """
     tick = callback("progress", progress)
+    stack = as_stack(stack, **keywords)
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
     coding = coding_of(stack) if coding is None else coding
     plan = _Plan.of(stack, darks, coding)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._arguments import listed, whole_number
+from hsnoise._keys import key_of
 from hsnoise._types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
@@ -140,18 +141,20 @@ class STLSTM(eqx.Module):
 
     def __init__(
         self,
-        key: RandomKey,
+        key: RandomKey | int,
         *,
         maps: int = 64,
         kernels: Sequence[int] = (3, 5, 5, 3),
         stride: int = 2,
         channels: int = 3,
     ):
-        """Make an untrained network.
+        """Make an untrained network, its weights drawn from `key`: a random key, or a whole number as its seed.
 
         Raises:
-            ValueError: for sizes below 1 or even kernels, TypeError for what is no whole number.
+            ValueError: for sizes below 1, even kernels or a seed out of range, TypeError for what is no whole number,
+                or no random key.
         """
+        key = key_of("key", key)
         for name, value in {"maps": maps, "stride": stride, "channels": channels}.items():
             whole_number(name, value, 1)
         kernels = listed("kernels", kernels, "odd sizes, one a layer")

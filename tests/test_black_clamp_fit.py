@@ -27,7 +27,7 @@ def test_clamp_and_gain_are_found_together():
     clamped = MODEL.add(fx.BlackClamp(whole))
     result = hsnoise.fit(capture(clamped), model=clamped)
     assert result.method == "ml"
-    for name, (truth, _) in clamped.table().items():
+    for name, (truth, _, _) in clamped.table.items():
         value, error, _ = result.table[name]
         assert error == 0 or abs(value - truth) < 4 * error, name
 

@@ -81,9 +81,9 @@ def test_fit_writes_a_model_a_table_and_figures(fitted):
     model = hsnoise.NoiseModel.load(fitted / "model.json")
     rows = list(csv.DictReader((fitted / "table.csv").read_text().splitlines()))
     assert {row["parameter"]: float(row["value"]) for row in rows} == pytest.approx(
-        {name: value for name, (value, _) in model.table().items()}, rel=1e-12
+        {name: value for name, (value, _, _) in model.table.items()}, rel=1e-12
     )
-    truth = hsnoise.NoiseModel.load(fitted.parent / "true.json").table()
+    truth = hsnoise.NoiseModel.load(fitted.parent / "true.json").table
     for row in rows:
         error = float(row["standard_error"])
         if 0 < error < np.inf:

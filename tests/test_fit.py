@@ -37,7 +37,7 @@ def capture(model, *, seed=7, exposure_s=EXPOSURE_S, frames=FRAMES, shape=SHAPE,
 
 def pulls(result, model):
     """(estimate - truth) / standard error of all fitted parameters."""
-    truth = {name: value for name, (value, _) in model.table().items()}
+    truth = {name: value for name, (value, _, _) in model.table.items()}
     return {name: (result.table[name][0] - truth[name]) / result.table[name][1] for name in result.names}
 
 
@@ -77,7 +77,7 @@ def test_fitted_model_samples_and_survives_its_file(canon_fit, tmp_path):
     result.params.save(tmp_path / "camera.json", provenance={"method": result.method})
     assert json.loads((tmp_path / "camera.json").read_text())["provenance"] == {"method": "ml"}
     again = hsnoise.NoiseModel.load(tmp_path / "camera.json")
-    assert again.table() == result.params.table()
+    assert again.table == result.params.table
     frames = hsnoise.sample(jax.random.key(0), np.full((3, 8, 8), 4.0), again)
     assert frames.shape == (3, 8, 8) and frames.dtype == np.uint32  # no white level is known
 

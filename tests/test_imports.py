@@ -13,13 +13,13 @@ import hsnoise
 
 ROOT = Path(hsnoise.__file__).parent
 # A module may import those before it, and its own package.
-ORDER = """_conclusion _types _keys _threads _compiling _memory _numerics _poisson _coloured _frames
-    _reading _describing _joining _arguments _output examples stack io effects _effect_json arrivals
-    signal_chain stlstm weights video model mosaic cameras photometry _counting flat_pairs flats flat_gain
-    narrow_noise statistics structure draws decomposition pixels rows flat_likelihood physics moments plan
-    likelihood coordinates maximise profile result flat_notes notes lut line_spectrum line knobs synthetic
-    pixel_fit pixel_result doubts fit plots _budget_table budget criticism inspection report _sheet training
-    _options _table _progress _enhance _loading _sample cli __main__""".split()
+ORDER = """_conclusion _html _pandas _types _keys _threads _compiling _memory _numerics _poisson _coloured _frames
+    _reading _describing _joining _arguments _output examples stack io _source effects _effect_json arrivals signal_chain
+    stlstm weights video model mosaic cameras photometry _counting flat_pairs flats flat_gain narrow_noise
+    statistics structure draws decomposition pixels rows flat_likelihood physics moments plan likelihood
+    coordinates maximise profile result flat_notes notes lut line_spectrum line knobs synthetic pixel_fit
+    pixel_result doubts fit plots _budget_table budget criticism inspection report _sheet training _options
+    _table _progress _enhance _loading _sample cli __main__""".split()
 IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames", "_joining"}
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"]
 
@@ -75,7 +75,7 @@ import sys, jax
 before = dict(jax.config.values)
 import hsnoise
 assert dict(jax.config.values) == before, "import hsnoise changed jax.config"
-heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2"} & set(sys.modules)
+heavy = {"matplotlib", "rawpy", "astropy", "tifffile", "h5py", "exifread", "PIL", "jinja2", "pandas"} & set(sys.modules)
 assert not heavy, heavy
 assert set(hsnoise.__all__) <= set(dir(hsnoise))
 import hsnoise.cli
@@ -83,3 +83,11 @@ heavy = {"matplotlib", "optax", "skimage", "av"} & set(sys.modules)
 assert not heavy, heavy
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_completion_shows_public_names_only():
+    names = dir(hsnoise)
+    assert set(names) == {*hsnoise.__all__, "__version__", "plots"} and len(names) == len(set(names))
+    assert all(getattr(hsnoise, name) is not None for name in names)
+    assert {"fit", "load", "sample", "improve", "cameras", "effects"} <= set(names)
+    assert not {"np", "jax", "Any", "annotations", "import_module", "logging", "io", "model"} & set(names)

@@ -38,7 +38,7 @@ def test_bins_are_those_of_the_others_and_the_law_that_of_the_outliers(share):
 @pytest.mark.parametrize("share", [1e-3, pytest.param(1e-2, marks=pytest.mark.slow), 3e-2])
 def test_saturated_pixels_leave_the_parameters_alone(share):
     result = hsnoise.fit(capture(share))
-    truth = MODEL.table()
+    truth = MODEL.table
     assert result.method == "ml"
     for name in result.names:
         value, error, _ = result.table[name]

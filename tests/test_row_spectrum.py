@@ -33,7 +33,7 @@ def capture(model, seed=0, exposure_s=EXPOSURE_S, frames=8, shape=(64, 96), shut
 
 def pulls(result, model):
     """(estimate - truth) / standard error of all fitted parameters."""
-    truth = {name: value for name, (value, _) in model.table().items()}
+    truth = {name: value for name, (value, _, _) in model.table.items()}
     return {name: (result.table[name][0] - truth[name]) / result.table[name][1] for name in result.names}
 
 

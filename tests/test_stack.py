@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from hsnoise._frames import LazyFrames
 from hsnoise._reading import check_frame
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise._source import as_stack
+from hsnoise.stack import FrameStack
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -333,16 +334,6 @@ def test_repr():
         "  dark      0.02 s  2 frames, 20.0 degrees Celsius\n"
         "  flat         5 s  1 frame, 30 photoelectrons per pixel"
     )
-
-
-def test_as_stack():
-    stack = FrameStack(dark_counts(2, 4, 4), 1.0)
-    assert as_stack(stack) is stack
-    assert as_stack(dark_counts(2, 4, 4), exposure_s=1.0, cfa="GBRG").cfa == "GBRG"
-    with pytest.raises(TypeError, match="cfa: only go with a bare array"):
-        as_stack(stack, cfa="RGGB")
-    with pytest.raises(TypeError, match="hsnoise.load reads files"):
-        as_stack("darks/", exposure_s=1.0)
 
 
 @settings(max_examples=100, deadline=None)

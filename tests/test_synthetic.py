@@ -81,7 +81,7 @@ def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
     stack, base = hidden
     assert abs(base.table["row_gain.sigma.B"][0] - 0.114) > 0.03  # the row noise passes for row gain
     fit = fit_synthetic(base, stack, base.params.add(RowNoise(1.4)))
-    for name, (value, _) in TRUTH.table().items():
+    for name, (value, _, _) in TRUTH.table.items():
         found, error, _ = fit.table[name]
         assert abs(found - value) <= 4 * error, f"{name}: {found} +- {error}, truth {value}"
 

@@ -108,8 +108,8 @@ def test_stills_move_smoothly():
 
 def test_jitter_changes_what_may_not_be_negative_by_a_tenth():
     model = hsnoise.cameras.canon_5d3(black_level_dn=64)
-    drawn = [jittered(jax.random.key(i), model).table() for i in range(30)]
-    for name, (value, _) in model.table().items():
+    drawn = [jittered(jax.random.key(i), model).table for i in range(30)]
+    for name, (value, _, _) in model.table.items():
         ratio = np.array([table[name][0] for table in drawn]) / max(value, 1e-12)
         if name.startswith("black_level") or name == "row_gain.exponent":
             assert np.all(ratio == 1), name
@@ -123,7 +123,7 @@ def test_jitter_changes_what_may_not_be_negative_by_a_tenth():
 def test_simpler_noise_is_as_strong_before_it_is_clipped(kind):
     """At a black level of 0 half of the noise is cut off, of the camera and of what stands for it."""
     models = [hsnoise.cameras.grasshopper3(black_level_dn=black) for black in (0, 200)]
-    numbers = [{n: value for n, (value, _) in matched(m, kind, 4.0).table().items()} for m in models]
+    numbers = [{n: value for n, (value, _, _) in matched(m, kind, 4.0).table.items()} for m in models]
     assert numbers[0]["read_noise.sigma"] == pytest.approx(numbers[1]["read_noise.sigma"], rel=0.02)
 
 

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise import _html
 from hsnoise._arguments import callback, seed_of, whole_number
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._pandas import data_frame
+from hsnoise._source import as_stack
 from hsnoise._threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.draws import check_effects, check_fits, darks_of, part_of
 from hsnoise.likelihood import log_likelihood
 from hsnoise.model import NoiseModel
 from hsnoise.result import number
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 from hsnoise.structure import explained
 
 DRAWS = 40
@@ -81,22 +85,44 @@ class Comparison:
 
         return plots.comparison(self)
 
-    def __str__(self) -> str:
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame: statistic, group, measured, model, z (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return data_frame(self, ("statistic", "group", "measured", "model", "z"), self.table)
+
+    def _misfits(self) -> Table:
         table = Table("group of statistics", "misfit")
         for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
             table.add_row(name, f"{misfit:.2f}")
-        console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(
+        return table
+
+    @property
+    def _error_in_words(self) -> str:
+        return (
             f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
-            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}",
-            highlight=False,
+            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}"
         )
-        console.print(table)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(self._error_in_words, highlight=False)
+        console.print(self._misfits())
         for sentence in (*self.worst, *explained(self.worst), *self.skipped):
             console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return _html.fragment(
+            _html.conclusion(self.conclusion),
+            _html.paragraph(self._error_in_words),
+            _html.printed(self._misfits()),
+            _html.sentences(self.worst),
+            _html.details("About the statistics", _html.sentences((*explained(self.worst), *self.skipped))),
+        )
 
 
 def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, progress=None, **keywords) -> Comparison:
@@ -104,12 +130,14 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
 
     Args:
         params: any NoiseModel, fitted or from a file.
-        stack: FrameStack, or a bare array with FrameStack's keywords.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+            FrameStack's keywords.
         draws: captures that are drawn from the model as yardstick.
         seed: of the draws; progress: called with no argument after each.
 
     Raises:
-        TypeError, ValueError: model and stack do not fit together, no darks, fewer than 8 draws.
+        FileNotFoundError, TypeError, ValueError: what `load` or `FrameStack` refuse; model and stack do not fit
+            together, no darks, fewer than 8 draws.
     """
     draws, seed = whole_number("draws", draws, 8), seed_of("seed", seed)
     tick = callback("progress", progress)

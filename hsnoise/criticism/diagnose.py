@@ -8,6 +8,7 @@ systems", Nature 466, 2010), and a verdict is given only if the winner also expl
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback, listed, seed_of, whole_number
+from hsnoise._source import as_stack
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
@@ -40,7 +42,8 @@ from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
-from hsnoise.stack import as_stack
+
+log = logging.getLogger(__name__)
 
 DRAWS = 64
 GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
@@ -73,25 +76,27 @@ def diagnose(
 
     Args:
         fit: result of `hsnoise.fit` on this capture, or one like it (a NoiseModel is taken, too).
-        stack: FrameStack, or a bare array with FrameStack's keywords; darks, and flats if there are any.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+            FrameStack's keywords. Darks, and flats if there are any.
         candidates: effects of your own, ready-made instances, that take part beside the built-in ones.
         draws: captures drawn from the fitted model; seed: of all draws.
         progress: called with no argument after each capture that is drawn.
 
     Raises:
-        TypeError, ValueError: fit and stack do not belong together; a candidate is no effect, is in the model, or
-            returns what is no signal of a sensor (another shape, NaN, numbers of another unit).
+        FileNotFoundError, TypeError, ValueError: what `load` or `FrameStack` refuse; fit and stack do not belong
+            together; a candidate is no effect, is in the model, or returns what is no signal of a sensor (another
+            shape, NaN, numbers of another unit).
     """
+    tick = callback("progress", progress)
+    draws, seed = whole_number("draws", draws, MANY_DETAILS), seed_of("seed", seed)
+    stack = as_stack(stack, **keywords)
     if isinstance(fit, FitResult) and fit.added:
-        options = {**keywords, "candidates": candidates, "draws": draws, "seed": seed, "progress": progress}
+        options = {"candidates": candidates, "draws": draws, "seed": seed, "progress": progress}
         if len(fit.added) <= FEW:
             found = diagnose(fit.without(fit.added), stack, **options)
             if found.best is not None and found.best.name in fit.added:
                 return found
         return diagnose(replace(fit, added=()), stack, **options)
-    tick = callback("progress", progress)
-    draws, seed = whole_number("draws", draws, MANY_DETAILS), seed_of("seed", seed)
-    stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
         raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
@@ -102,12 +107,17 @@ def diagnose(
     for maker in own.values():
         check_effects(model.add(made(maker, 1.0, 0)), part)
     makers = {name: maker for name, maker in built_in(model, part).items() if name not in own}
+    log.info(
+        "Drawing %d captures from the model, and each of %d candidates on top of it", draws, len(makers) + len(own)
+    )
     bench = Bench(model, part, reference(model, part, draws, seed, tick), seed, tick)
     slopes = bench.slopes()
     null = shrunk(bench.base.own_z(), slopes)
     z = bench.base.z(measure(part, model).values)
     evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
+    log.info("Most likely at first: %s", _scores(judged[:WORST]))
+    log.debug("All candidates: %s", _scores(judged))
     pair = None
     if EVIDENCE < judged[0].score < SURE:
         evidence = replace(evidence, limit=_limit(judged, draws, bench, evidence))
@@ -130,12 +140,18 @@ def diagnose(
             found = _verdict(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, laws)
             if found.best is candidate:
                 found = replace(found, unexplained=_what_remains(left, law))
+    log.info("Diagnosis: %s", found.conclusion)
+    log.debug("%s", found)
     if found.verdict != "unexplained":
         return found
     prints = [one.of for one in judged]
     return replace(
         found, nearest=nearest(prints, found.ranking, evidence, slopes, np.diagonal(bench.base.law.covariance))
     )
+
+
+def _scores(judged: Iterable[Judged]) -> str:
+    return ", ".join(f"{one.of.name} {one.score:.1f} nats" for one in judged)
 
 
 def _limit(judged: list[Judged], draws: int, bench: Bench, evidence: Evidence) -> float:

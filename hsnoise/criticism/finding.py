@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise import _html
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._pandas import data_frame
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
@@ -101,19 +104,39 @@ class Diagnosis:
 
         return plots.ranking(self)
 
-    def __str__(self) -> str:
+    def to_pandas(self) -> Any:
+        """`ranking` as a pandas DataFrame: effect, score_nats, p, z_left (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        rows = ((c.name, c.score, c.p_value, c.misfit) for c in self.ranking)
+        return data_frame(self, ("effect", "score_nats", "p", "z_left"), rows)
+
+    def _leaders(self) -> Table:
         table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:z.1f}", c.chance, f"{c.misfit:z.1f}")
+        return table
+
+    def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(self.headline, highlight=False)
-        console.print(table)
+        console.print(self._leaders())
         for sentence in (LEGEND, *self.sentences, self._remains()):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        remains = [sentence for sentence in (self._remains(),) if sentence]
+        return _html.fragment(
+            _html.conclusion(self.conclusion),
+            _html.printed(self._leaders()),
+            _html.sentences(self.sentences),
+            _html.details("What the columns mean, and what is left", _html.sentences((LEGEND, *remains))),
+        )
 
     def _remains(self) -> str:
         """What is still off with what is named in the model."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._arguments import callback, counter, seed_of, whole_number
+from hsnoise._source import as_stack
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
@@ -22,8 +24,10 @@ from hsnoise.fit import fit, rechecked
 from hsnoise.model import NoiseModel
 from hsnoise.physics import WITH_LIKELIHOOD
 from hsnoise.result import FitResult, number, rounded
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 from hsnoise.synthetic import fit_synthetic
+
+log = logging.getLogger(__name__)
 
 MOST_STEPS = 8
 MOST_TRIED = 4  # effects, where none explains all
@@ -55,7 +59,8 @@ def improve(
     story goes on; it is told as finished only if nothing significant is left.
 
     Args:
-        stack: FrameStack, or a bare array with FrameStack's keywords.
+        stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
+            FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
         max_minutes: after which no further effect is looked for; None: as long as it takes.
@@ -65,35 +70,41 @@ def improve(
             that nothing is lost.
 
     Raises:
-        TypeError, ValueError: bad input, before any long work.
+        FileNotFoundError, TypeError, ValueError: bad input, before any long work.
     """
-    say, keep, seed = callback("progress", progress), callback("keep", keep), seed_of("seed", seed)
+    tell, keep, seed = callback("progress", progress), callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     fitted, held_out = split_frames(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
     limit = _Limit.of(max_minutes, max_steps)
-    work, split = _Work(fitted, held_out, seed, say), told_of(fitted, held_out)
-    say("Fitting the first model")
+    work, split = _Work(fitted, held_out, seed, tell), told_of(fitted, held_out)
+    work.say("Fitting the first model")
     steps = work.begun(fit(fitted, model=model))
     measured = len(steps)
     while True:
         if reached := limit.reached(len(steps) - measured):
-            return Story(tuple(steps), f"It stopped after {reached}; something may be left.", split)
+            return _ended(steps, f"It stopped after {reached}; something may be left.", split)
         last = steps[-1]
         keep(Story(tuple(steps), UNFINISHED, split))
         own = [c for c in candidates if c.name not in last.fit.params]
-        tick = counter(say, "Looking for what is missing")
+        tick = counter(tell, "Looking for what is missing")
         found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000, progress=tick)
         steps[-1] = last = replace(last, diagnosis=found)
         nearest = _nearest(found)
         if nearest and _is_too_little(nearest, steps):
-            return Story(tuple(steps), _would_be_next(nearest[0], last.comparison), split)
+            return _ended(steps, _would_be_next(nearest[0], last.comparison), split)
         if not nearest:
-            return Story(tuple(steps), _end(found, last.comparison), split)
+            return _ended(steps, _end(found, last.comparison), split)
         step, refused = work.first_that_holds(nearest, steps)
         if step is None:
-            return Story(tuple(steps), _left_out(refused, found, last.comparison), split)
+            return _ended(steps, _left_out(refused, found, last.comparison), split)
         steps.append(step)
+
+
+def _ended(steps: list[Step], why: str, split: str) -> Story:
+    story = Story(tuple(steps), why, split)
+    log.info("Improved: %s", story.conclusion)
+    return story
 
 
 @dataclass(frozen=True)
@@ -127,11 +138,17 @@ class _Work:
     fitted: FrameStack
     held_out: FrameStack | None
     seed: int
-    say: Callable[[str], None]
+    tell: Callable[[str], None]
+
+    def say(self, text: str) -> None:
+        """Tell of a stage, and log it."""
+        log.info("%s", text)
+        self.tell(text)
 
     def step(self, result: FitResult, added: str | None, before: Step | None) -> Step:
         self.say("Comparing with the model's own samples")
         comparison = compare(result.params, self.fitted, seed=self.seed)
+        log.info("Error %s with %s", number(comparison.error), added or "the first model")
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
 
@@ -181,7 +198,7 @@ class _Work:
             text = f"Adding {effect.name}" if effect is candidate.effect else "The same on the other side of the gain"
             self.say(text)
             try:
-                fits.append(_fit_with(effect, steps, self.fitted, counter(self.say, text)))
+                fits.append(_fit_with(effect, steps, self.fitted, counter(self.tell, text)))
             except (RuntimeError, ValueError) as error:
                 self.say(f"{effect.name} cannot be fitted here: {error}")
         if not fits:

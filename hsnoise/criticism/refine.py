@@ -63,8 +63,8 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
     """
     own = bench.base.law.covariance
     model = bench.model.add(effect)
-    numbers = knobs(model, (effect.name,)), _base_knobs(model)
-    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in numbers]) ** -2
+    turned = knobs(model, (effect.name,)), _base_knobs(model)
+    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in turned]) ** -2
 
     def step(shifts: np.ndarray, slopes: np.ndarray, gone: np.ndarray) -> np.ndarray:
         law = _law_nearby(shifts, own)
@@ -73,8 +73,9 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
         weighted = slopes.T @ (share[:, None] * np.linalg.inv(law.covariance) * share)
         return np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * gone)
 
-    there = _stepped(model, [*numbers[0], *numbers[1]], step, bench)
-    shifts = np.stack(in_threads(lambda number: bench.shift(there, number), range(MANY_DRAWS), bench.tick))
+    there = _stepped(model, [*turned[0], *turned[1]], step, bench)
+    numbers = range(min(MANY_DRAWS, len(bench.base.draws)))
+    shifts = np.stack(in_threads(lambda number: bench.shift(there, number), numbers, bench.tick))
     return evidence.score(_law_nearby(shifts, own)), there[effect.name]
 
 

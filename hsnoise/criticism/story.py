@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from hsnoise import _html
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._pandas import data_frame
 from hsnoise._types import unit_in_words
 from hsnoise.criticism.compare import CLOSE, FITS, Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
@@ -116,32 +120,63 @@ class Story:
 
         return plots.story(self)
 
-    def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=100, color_system=None)
-        table = Table("step", "added", "error", "held-out / nats", "worst group")
+    def to_pandas(self) -> Any:
+        """The steps as a pandas DataFrame: step, added, error, held_out_nats, worst_group (needs `hsnoise[pandas]`).
+
+        `added` of the first is the model it began with. Raises ImportError without pandas.
+        """
+        return data_frame(self, ("step", "added", "error", "held_out_nats", "worst_group"), self._rows())
+
+    def _rows(self) -> Iterator[tuple[int, str, float, float, str]]:
         for i, step in enumerate(self.steps):
             worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
-            held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
-            name = step.added or self.start
-            table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
-        console.print(table)
+            yield i, step.added or self.start, step.comparison.error, step.held_out, worst
+
+    def _table(self) -> Table:
+        table = Table("step", "added", "error", "held-out / nats", "worst group")
+        for i, added, error, held_out, worst in self._rows():
+            table.add_row(str(i), added, f"{error:.2f}", "" if np.isnan(held_out) else f"{held_out:.1f}", worst)
+        return table
+
+    def _reason(self, i: int) -> str:
+        """Why step `i` was taken; empty for the first."""
+        step, before = self.steps[i], self.steps[i - 1]
+        if not step.added:
+            return ""
+        errors = f"{before.comparison.error:.2f} -> {step.comparison.error:.2f}"
+        return (
+            f"Step {i}: added {step.added}, because {_because(before, step)}; error {errors}{together(before, step)}."
+        )
+
+    @property
+    def _closing(self) -> list[str]:
+        """How it ended, and what to bear in mind."""
+        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+        return [sentence for sentence in (self.ended, care, self.split) if sentence]
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(self._table())
         for i, step in enumerate(self.steps):
-            if step.added:
-                before = self.steps[i - 1]
-                console.print(
-                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
-                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
-                    highlight=False,
-                )
+            reason = self._reason(i)
+            if reason:
+                console.print(f"- {reason}", highlight=False)
             for sentence in (*step.sizes, *step.moved):
                 console.print(f"  {sentence}", highlight=False)
-        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
-        for sentence in (self.ended, care, self.split):
-            if sentence:
-                console.print(sentence, highlight=False)
+        for sentence in self._closing:
+            console.print(sentence, highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        steps = [(self._reason(i), (*step.sizes, *step.moved)) for i, step in enumerate(self.steps)]
+        return _html.fragment(
+            _html.conclusion(self.conclusion),
+            _html.printed(self._table()),
+            _html.details("Why each effect was added", *(_html.sentences(told, reason) for reason, told in steps)),
+            _html.details("How it ended", _html.sentences(self._closing)),
+        )
 
 
 def together(before: Step, after: Step) -> str:

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
+from hsnoise import _html
 from hsnoise._arguments import callback
 from hsnoise._conclusion import Conclusion, Light
+from hsnoise._pandas import data_frame
+from hsnoise._source import as_stack
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.decomposition import COMPONENTS, Component
 from hsnoise.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.inspection._odd import odd_frames
 from hsnoise.inspection._verdict import about_growth, judged
-from hsnoise.io import load
-from hsnoise.stack import FrameStack, as_stack
+from hsnoise.stack import FrameStack
 
 MOST_ROWS = 12  # of the printed budget
+HEADINGS = ("kind", "exposure / s", "frames", "degrees C", "level / DN", "noise / DN", "hottest 0.1 % / DN")
 FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is named
 FEW_CODES = 0.5  # DN of noise below which counts are too coarse
 
@@ -62,13 +64,36 @@ class Inspection:
             "\n".join(_table(self.groups)),
             _listed("Read as", self.stack.assumed),
             _listed("Odd", self.findings) or "Nothing odd was found.",
-            "\n".join(_noise_table(self.budget)),
+            "\n".join(_noise_lines(self.budget)),
             _listed("What can be determined", self.determined),
             f"{self.verdict}\nNext: {self.next_capture}",
         ]
         return "\n\n".join(part for part in parts if part)
 
     __repr__ = __str__
+
+    def to_pandas(self) -> Any:
+        """`groups` as a pandas DataFrame: kind, exposure_s, frames, temperature_c, level_dn, noise_dn, hottest_dn (of
+        0.1 % of the pixels, above the median) (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        columns = ("kind", "exposure_s", "frames", "temperature_c", "level_dn", "noise_dn", "hottest_dn")
+        return data_frame(self, columns, map(_numbers, self.groups))
+
+    def _repr_html_(self) -> str:
+        head, levels, *_ = repr(self.stack).splitlines()
+        title, heads, rows = _noise_table(self.budget)
+        return _html.fragment(
+            _html.conclusion(self.conclusion),
+            _html.paragraph(f"{head.replace('FrameStack: ', '')}, {levels.strip()}"),
+            _html.sentences(self.findings, "Odd:"),
+            _html.table(HEADINGS, map(_cells, self.groups), words=("kind",)),
+            _html.paragraph(f"Next: {self.next_capture}"),
+            _html.details("What can be determined", _html.sentences(self.determined)),
+            _html.details("Read as", _html.sentences(self.stack.assumed)),
+            _html.details(title, _html.table(heads, rows, words=("",)) if rows else ""),
+        )
 
 
 def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection:
@@ -86,8 +111,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
             are named instead.
     """
     tick = callback("progress", progress)
-    is_path = isinstance(path_or_stack, str | PathLike) or _are_paths(path_or_stack)
-    stack = load(path_or_stack, **keywords) if is_path else as_stack(path_or_stack, **keywords)
+    stack = as_stack(path_or_stack, **keywords)
     facts = facts_of(stack, tick)
     elsewhere = None if stack.elsewhere is None else facts_of(stack.elsewhere, tick)
     main_budget, other_budget = _budget(facts), _budget(elsewhere)
@@ -120,10 +144,6 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         next_capture=found.next_capture,
         budget=main_budget,
     )
-
-
-def _are_paths(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(one, str | PathLike) for one in value)
 
 
 def _budget(facts: Facts | None) -> NoiseBudget | None:
@@ -168,41 +188,58 @@ def _overscan(stack: FrameStack, facts: Facts) -> list[str]:
     ]
 
 
+def _numbers(group: GroupFacts) -> tuple[str, float, int, float, float, float, float]:
+    levels = group.level_dn, group.temporal_dn, group.hot_dn
+    return group.kind, group.exposure_s, group.n_frames, group.temperature_c, *levels
+
+
+def _cells(group: GroupFacts) -> tuple[str, ...]:
+    """What HEADINGS say of a group, as text."""
+    kind, exposure_s, n_frames, temperature_c, level_dn, noise_dn, hot_dn = _numbers(group)
+    temperature = "-" if np.isnan(temperature_c) else f"{temperature_c:.1f}"
+    noise = "-" if np.isnan(noise_dn) else f"{noise_dn:.4g}"
+    return kind, f"{exposure_s:.6g}", f"{n_frames}", temperature, f"{level_dn:.2f}", noise, f"+{hot_dn:.4g}"
+
+
 def _table(groups: tuple[GroupFacts, ...]) -> list[str]:
-    lines = ["kind   exposure / s  frames  degrees C  level / DN  noise / DN  hottest 0.1 % / DN"]
-    for group in groups:
-        temperature = "-" if np.isnan(group.temperature_c) else f"{group.temperature_c:.1f}"
-        noise = "-" if np.isnan(group.temporal_dn) else f"{group.temporal_dn:.4g}"
-        lines.append(
-            f"{group.kind}   {group.exposure_s:12.6g}  {group.n_frames:6d}  {temperature:>9}  {group.level_dn:10.2f}"
-            f"  {noise:>10}  {f'+{group.hot_dn:.4g}':>18}"
-        )
-    return lines
+    """Headings and a line for each group, in columns as wide as the headings at least."""
+    widths = [len(heading) for heading in HEADINGS[1:]]
+    return [
+        f"{kind}   " + "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+        for kind, *cells in (HEADINGS, *map(_cells, groups))
+    ]
 
 
-def _noise_table(found: NoiseBudget | None) -> list[str]:
-    """The budget as standard deviations, of groups with several frames."""
+def _noise_table(found: NoiseBudget | None) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
+    """The budget as standard deviations, of groups with several frames: what it is, headings, rows."""
     rows = [] if found is None else [row for row in found.rows if row.n_frames > 1]
-    if not rows:
-        return []
     has_colours = len({row.channel for row in rows}) > 1
     shown = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, min(MOST_ROWS, len(rows))).astype(int))]
-    heads = [f"{name.replace('_', ' '):>16}" for name in COMPONENTS]
     some = f" ({len(shown)} of {len(rows)} lines)" if len(shown) < len(rows) else ""
-    lines = [f"Noise budget, standard deviations in DN{some}:", f"{'':{24 if has_colours else 22}}{''.join(heads)}"]
-    for row in shown:
-        name = f"{row.kind} {row.exposure_s:.6g} s" + (f" {row.channel}" if has_colours else "")
-        lines.append(f"{name:{24 if has_colours else 22}}{''.join(_cell(row.components[one]) for one in COMPONENTS)}")
-    return lines
+    names = [f"{row.kind} {row.exposure_s:.6g} s" + (f" {row.channel}" if has_colours else "") for row in shown]
+    cells = [
+        (name, *(_cell(row.components[one]) for one in COMPONENTS)) for name, row in zip(names, shown, strict=True)
+    ]
+    heads = ("", *(name.replace("_", " ") for name in COMPONENTS))
+    return f"Noise budget, standard deviations in DN{some}", heads, cells
+
+
+def _noise_lines(found: NoiseBudget | None) -> list[str]:
+    title, heads, rows = _noise_table(found)
+    if not rows:
+        return []
+    width = max(22, *(len(name) + 2 for name, *_ in rows))
+    lines = (f"{name:{width}}" + "".join(f"{cell:>16}" for cell in cells) for name, *cells in (heads, *rows))
+    return [f"{title}:", *lines]
 
 
 def _cell(component: Component) -> str:
     """Standard deviation, DN, or what it is below."""
     value, error = component.variance_dn2, component.standard_error_dn2
     if not np.isfinite(value):
-        return f"{'-':>16}"
+        return "-"
     bound = f"< {np.sqrt(max(value, 0.0) + 2 * error):.2g}"
-    return f"{bound if value < 2 * error else f'{np.sqrt(value):.3g}':>16}"
+    return bound if value < 2 * error else f"{np.sqrt(value):.3g}"
 
 
 def _listed(title: str, sentences: tuple[str, ...]) -> str:

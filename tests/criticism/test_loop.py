@@ -143,7 +143,7 @@ def test_added_effect_is_fitted_with_the_base():
     stack = capture(fx.RowNoise(1.0), frames=6)
     result = hsnoise.fit(stack, model=MODEL.add(fx.RowNoise(0.5)))
     assert result.method == "synthetic"
-    truth = {name: value for name, (value, _) in MODEL.add(fx.RowNoise(1.0)).table().items()}
+    truth = {name: value for name, (value, _, _) in MODEL.add(fx.RowNoise(1.0)).table.items()}
     for name in (*[n for n in result.names if n.startswith(("gain", "dark", "read"))], "row_noise.sigma"):
         value, error, _ = result.table[name]
         assert abs(value - truth[name]) < 4.5 * error, name

@@ -108,7 +108,7 @@ def test_arguments_are_named(call):
         call(CAMERA, COUNTS, draws=3, **CAPTURE)
     with pytest.raises(TypeError, match="seed: expected a whole number, got 'x'"):
         call(CAMERA, COUNTS, seed="x", **CAPTURE)
-    with pytest.raises(TypeError, match="stack: expected a FrameStack or an array of counts, got NoiseModel"):
+    with pytest.raises(TypeError, match="stack: expected a path, a FrameStack or an array of counts, got NoiseModel"):
         call(COUNTS, CAMERA)
     with pytest.raises(ValueError, match="frames 0 and 1 of the 0.03 s exposure are identical"):
         call(CAMERA, np.repeat(COUNTS[:, :1], 4, axis=1), **CAPTURE)
