@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from hsnoise import cameras
+from hsnoise import _interrupting, cameras  # noqa: F401  the first is for Ctrl-C while the others are imported
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param

@@ -173,6 +173,7 @@ class FitResult:
         for name, (value, error, unit) in self.table.items():
             table.add_row(name, *rounded(value, error), unit_in_words(unit))
         console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(f"{title}: {darks}{flats}", highlight=False)
         for doubt in self.doubts:
             console.print(f"! {doubt}", highlight=False)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import _options, _output, cli
+from hsnoise import _demo, _options, _output, criticism
 from hsnoise._loading import load_capture
 from hsnoise.cli import main
 from hsnoise.criticism import Comparison, Step, Story
@@ -113,13 +113,13 @@ def short_loop(monkeypatch):
         keep(Story((steps[0],), "Not finished."))
         return Story(tuple(steps), "Nothing significant is left.")
 
-    monkeypatch.setattr(hsnoise, "improve", improve)
+    monkeypatch.setattr(criticism, "improve", improve)
 
 
 def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, short_loop):
-    monkeypatch.setattr(cli, "DEMO_FRAMES", 2)
-    monkeypatch.setattr(cli, "DEMO_SHAPE", (32, 64))
-    monkeypatch.setattr(cli, "DEMO_EXPOSURES_S", (0.1, 0.4))
+    monkeypatch.setattr(_demo, "FRAMES", 2)
+    monkeypatch.setattr(_demo, "SHAPE", (32, 64))
+    monkeypatch.setattr(_demo, "EXPOSURES_S", (0.1, 0.4))
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out), "--debug"]) == 0
     said = capsys.readouterr().out
@@ -133,13 +133,13 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
 
 
 def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop):
-    whole = hsnoise.improve
+    whole = criticism.improve
 
     def broken_off(stack, **keywords):
         whole(stack, **keywords)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(hsnoise, "improve", broken_off)
+    monkeypatch.setattr(criticism, "improve", broken_off)
     arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
     assert main(arguments) == 130
     assert "Not finished" in (tmp_path / "story.txt").read_text()
@@ -278,7 +278,8 @@ def test_wrong_options_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
-    assert "error:" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.startswith("hsnoise: ") and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", COMMANDS)

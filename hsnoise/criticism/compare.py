@@ -75,6 +75,14 @@ class Comparison:
         """The misfit that the worst group takes on the model's own draws, their median: what `error` is measured by."""
         return max(self.groups.values()) / self.error if self.error > 0 else 1.0
 
+    @property
+    def measure(self) -> str:
+        """What the error is, in words."""
+        return (
+            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
+            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}"
+        )
+
     def plot(self):
         """A figure of where the model fails: `hsnoise.plots.comparison`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -86,11 +94,8 @@ class Comparison:
         for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
             table.add_row(name, f"{misfit:.2f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(
-            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
-            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}",
-            highlight=False,
-        )
+        console.print(str(self.conclusion), markup=False, highlight=False)
+        console.print(self.measure, highlight=False)
         console.print(table)
         for sentence in (*self.worst, *explained(self.worst), *self.skipped):
             console.print(f"- {sentence}", highlight=False)

@@ -106,17 +106,18 @@ class Diagnosis:
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:z.1f}", c.chance, f"{c.misfit:z.1f}")
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(self.headline, highlight=False)
+        console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(table)
-        for sentence in (LEGEND, *self.sentences, self._remains()):
+        for sentence in (LEGEND, *self.sentences, self.remains):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
 
-    def _remains(self) -> str:
-        """What is still off with what is named in the model."""
+    @property
+    def remains(self) -> str:
+        """What is still off with what is named in the model, in a sentence; empty if nothing stands out."""
         if not self.names or not self.unexplained.stands_out:
             return ""
         left, statistics = self.unexplained, "; ".join(self.unexplained.statistics)

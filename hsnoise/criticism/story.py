@@ -110,6 +110,25 @@ class Story:
         """`error` of each step."""
         return tuple(step.comparison.error for step in self.steps)
 
+    @property
+    def details(self) -> tuple[str, ...]:
+        """What was added in each step, why, how large it is, and what else moved, in sentences."""
+        told = []
+        for i, step in enumerate(self.steps):
+            if step.added:
+                before = self.steps[i - 1]
+                told.append(
+                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
+                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}."
+                )
+            told += [f"  {sentence}" for sentence in (*step.sizes, *step.moved)]
+        return tuple(told)
+
+    @property
+    def care(self) -> str:
+        """What to mind of the last fit; empty if it converged."""
+        return "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+
     def plot(self):
         """A figure of the error falling: `hsnoise.plots.story`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -124,21 +143,10 @@ class Story:
             held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
             name = step.added or self.start
             table.add_row(str(i), name, f"{step.comparison.error:.2f}", held_out, worst)
-        console.print(table)
-        for i, step in enumerate(self.steps):
-            if step.added:
-                before = self.steps[i - 1]
-                console.print(
-                    f"- Step {i}: added {step.added}, because {_because(before, step)}; error"
-                    f" {before.comparison.error:.2f} -> {step.comparison.error:.2f}{together(before, step)}.",
-                    highlight=False,
-                )
-            for sentence in (*step.sizes, *step.moved):
-                console.print(f"  {sentence}", highlight=False)
-        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
-        for sentence in (self.ended, care, self.split):
+        console.print(str(self.conclusion), table, sep="\n", highlight=False, markup=False)
+        for sentence in (*self.details, self.ended, self.care, self.split):
             if sentence:
-                console.print(sentence, highlight=False)
+                console.print(sentence, highlight=False, markup=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__

@@ -55,18 +55,22 @@ class Inspection:
             return Conclusion(Light.RED, self.verdict)
         return Conclusion(Light.AMBER if self.findings else Light.GREEN, self.verdict)
 
-    def __str__(self) -> str:
+    @property
+    def parts(self) -> dict[str, str]:
+        """What is printed, by name: the capture, its groups, what is odd, the budget, what can be had, what is next."""
         head, levels, *_ = repr(self.stack).splitlines()
-        parts = [
-            f"{head.replace('FrameStack: ', '')}\n{levels}",
-            "\n".join(_table(self.groups)),
-            _listed("Read as", self.stack.assumed),
-            _listed("Odd", self.findings) or "Nothing odd was found.",
-            "\n".join(_noise_table(self.budget)),
-            _listed("What can be determined", self.determined),
-            f"{self.verdict}\nNext: {self.next_capture}",
-        ]
-        return "\n\n".join(part for part in parts if part)
+        return {
+            "capture": f"{head.replace('FrameStack: ', '')}\n{levels}",
+            "groups": "\n".join(_table(self.groups)),
+            "assumed": _listed("Read as", self.stack.assumed),
+            "odd": _listed("Odd", self.findings) or "Nothing odd was found.",
+            "budget": "\n".join(_noise_table(self.budget)),
+            "determined": _listed("What can be determined", self.determined),
+            "next": f"Next: {self.next_capture}",
+        }
+
+    def __str__(self) -> str:
+        return "\n\n".join(part for part in (str(self.conclusion), *self.parts.values()) if part)
 
     __repr__ = __str__
 
