@@ -196,7 +196,9 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
 def _sample_arguments(commands: Any) -> None:
     text = "Draw raw frames from a noise model: dark frames, or noisy frames of a clean image."
     sample = commands.add_parser("sample", help="make frames with the noise of a camera", description=text)
-    sample.add_argument("model", metavar="MODEL", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}")
+    sample.add_argument(
+        "model", metavar="MODEL", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}"
+    )
     sample.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help=f"file to write: {' '.join(FRAME_FORMATS)}"
     )

@@ -19,7 +19,14 @@ from hsnoise.photometry import scale_to_photoelectrons
 
 SAMPLE_SHAPE = (480, 640)
 # What files of other formats than .npz hold of the metadata, and what `hsnoise.load` takes where nothing is said.
-HELD = {".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
+HELD = {".npy": (), ".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
+BARE = {  # Python that reads the counts alone
+    ".npz": "import numpy as np; counts = np.load({})['counts']",
+    ".npy": "import numpy as np; counts = np.load({})",
+    ".tif": "import tifffile; counts = tifffile.imread({})",
+    ".tiff": "import tifffile; counts = tifffile.imread({})",
+    ".fits": "from astropy.io import fits; counts = fits.getdata({})",
+}
 DEFAULTS = {"kind": "dark", "cfa": "mono", "shutter": "rolling"}
 
 
@@ -58,15 +65,17 @@ def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]
     if metadata["kind"] == "flat":
         lines.append('kind "flat": a picture of light, with the dark current added; no dark frames')
     held = HELD.get(path.suffix.lower(), tuple(metadata))
-    if path.suffix.lower() == ".npy":
-        lines.append("The file holds counts only, no exposure, Bayer order or black level; .npz holds all")
-        return [*lines, f"In Python: import numpy as np; counts = np.load({str(path)!r})"]
-    lines.append(f"Beside the counts the file holds {', '.join(held)}")
-    given = {
-        name: value for name, value in metadata.items() if name not in held and np.any(value != DEFAULTS.get(name))
-    }
-    words = ", ".join([repr(str(path)), *(f"{name}={_value(value)}" for name, value in given.items())])
-    return [*lines, f"In Python: import hsnoise; stack = hsnoise.load({words})"]
+    lines.append(f"Beside the counts the file holds {', '.join(held)}" if held else "The file holds counts only")
+    return [*lines, f"In Python: {_reading(path, n * frames, metadata, held)}"]
+
+
+def _reading(path: Path, n_frames: int, metadata: dict[str, Any], held: tuple[str, ...]) -> str:
+    """A line of Python that reads a file: counts alone where `hsnoise.load` would want more than the file holds."""
+    suffix, name = path.suffix.lower(), repr(str(path))
+    if n_frames == 1 or suffix == ".npy":
+        return BARE[suffix].format(name)
+    given = {key: value for key, value in metadata.items() if key not in held and np.any(value != DEFAULTS.get(key))}
+    return f"import hsnoise; stack = hsnoise.load({', '.join([name, *(f'{k}={_value(v)}' for k, v in given.items())])})"
 
 
 def _value(value: Any) -> str:

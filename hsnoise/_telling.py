@@ -63,7 +63,7 @@ class Page:
 
 
 def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
-    """Print a page: what fits on one screen, and how many lines were left out, or all. `foot` comes last, in full."""
+    """Print a page: what fits on one screen, how many lines were left out, and the `foot` in full; or all."""
     console = screen()
     doubts = [Text(f"! {in_options(one)}", page.colour) for one in page.doubts]
     head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
@@ -76,7 +76,7 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     left_out = _count(everything) - _count(shown)
     more = [f"{left_out} more line{'s' if left_out > 1 else ''}: --verbose"] if left_out else []
     # In one piece: a reader that is gone is no reason to break off in the middle.
-    print("\n".join([*(text for text, _ in (*shown, *last)), *more]), flush=True)
+    print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), flush=True)
 
 
 def in_options(text: str) -> str:
@@ -155,7 +155,7 @@ def page_of_inspection(found: Inspection) -> Page:
     return Page(
         conclusion=found.conclusion,
         doubts=found.findings,
-        tables=(parts["capture"], parts["groups"]),
+        tables=(f"\n{parts['capture']}\n", f"{parts['groups']}\n"),
         notes=(*notes, *parts["assumed"].splitlines()),
         rest=tuple(parts["budget"].splitlines()),
     )
@@ -192,7 +192,9 @@ def _printed(text: Text, console: Console) -> Printed:
 
 
 def _rows(table: Table | str, console: Console) -> list[Printed]:
-    return [(line, 1) for line in (_lines(table, console) if isinstance(table, Table) else table.splitlines())]
+    if isinstance(table, Table):
+        return [(line, 1) for line in _lines(table, console)]
+    return [(line, -(-len(line) // console.width) or 1) for line in table.split("\n")]
 
 
 def _lines(one: Table | Text, console: Console) -> list[str]:

@@ -37,6 +37,7 @@ One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` ele
 reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
 errors do not say: whether the model is right."""
+ASSUMED = 4  # sentences on the capture that are told before the work
 LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}")
 LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
 BROKEN_PIPE = 128 + 13  # as a shell has it of those whom SIGPIPE ended
@@ -106,7 +107,6 @@ def _inspect(args: argparse.Namespace) -> int:
 def _fit(args: argparse.Namespace) -> None:
     check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
-    stack.check()
     args.out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
     fit = fit_with_progress(stack, args.method, model, args.pixels)
     written = write_results(fit, args.out, {"files": args.paths})
@@ -157,10 +157,14 @@ def _improve(args: argparse.Namespace) -> None:
 
 
 def _load(args: argparse.Namespace) -> FrameStack:
-    """The capture; what was assumed about it is printed."""
+    """The capture, checked; what was assumed about it is printed."""
     stack = load_capture(args.paths, args)
-    for sentence in stack.assumed:
+    stack.check()
+    shown = stack.assumed if args.verbose else stack.assumed[:ASSUMED]
+    for sentence in shown:
         print(f"- {in_options(sentence)}", file=sys.stderr)
+    if len(stack.assumed) > len(shown):
+        print(f"- {len(stack.assumed) - len(shown)} more assumptions: --verbose", file=sys.stderr)
     return stack
 
 

@@ -52,7 +52,7 @@ def fitted(capture) -> Path:
 def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_path, capsys):
     arguments = [str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "loop")]
     assert main(["compare", *arguments, "--model", str(fitted / "model.json"), "--debug"]) == 0
-    assert "1.0: like the model's own samples" in capsys.readouterr().out
+    assert "as close as its own samples" in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "loop").iterdir()] == ["comparison.png"]
     assert main(["compare", *arguments, "--model", "canon_5d3"]) == 2
     assert "--model: made for RGGB" in capsys.readouterr().err
@@ -96,7 +96,7 @@ def test_fit_writes_a_model_a_table_and_figures(fitted):
 def test_fitted_model_can_be_sampled(fitted, tmp_path, capsys):
     out = tmp_path / "frames.npz"
     assert main(["sample", str(fitted / "model.json"), "--out", str(out), "--frames", "2", "--shape", "16x32"]) == 0
-    assert "2 frames of 16 x 32 pixels" in capsys.readouterr().out
+    assert "2 dark frames of 16 x 32 pixels" in capsys.readouterr().out
     stack = hsnoise.load(out)
     assert (stack.n_frames, stack.shape, stack.shutter, stack.black_level) == ((2,), (16, 32), "global", 64.0)
 
@@ -132,7 +132,7 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 
-def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop):
+def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop, capsys):
     whole = criticism.improve
 
     def broken_off(stack, **keywords):
@@ -142,6 +142,8 @@ def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, mon
     monkeypatch.setattr(criticism, "improve", broken_off)
     arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
     assert main(arguments) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"hsnoise: interrupted; the model so far is in {tmp_path / 'model.json'}"
     assert "Not finished" in (tmp_path / "story.txt").read_text()
     assert "read_noise" in hsnoise.NoiseModel.load(tmp_path / "model.json")
 

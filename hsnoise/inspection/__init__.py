@@ -173,13 +173,13 @@ def _overscan(stack: FrameStack, facts: Facts) -> list[str]:
 
 
 def _table(groups: tuple[GroupFacts, ...]) -> list[str]:
-    lines = ["kind   exposure / s  frames  degrees C  level / DN  noise / DN  hottest 0.1 % / DN"]
+    lines = ["kind   exposure / s  frames  degrees C  level / DN  noise / DN  top 0.1 % / DN"]
     for group in groups:
         temperature = "-" if np.isnan(group.temperature_c) else f"{group.temperature_c:.1f}"
         noise = "-" if np.isnan(group.temporal_dn) else f"{group.temporal_dn:.4g}"
         lines.append(
             f"{group.kind}   {group.exposure_s:12.6g}  {group.n_frames:6d}  {temperature:>9}  {group.level_dn:10.2f}"
-            f"  {noise:>10}  {f'+{group.hot_dn:.4g}':>18}"
+            f"  {noise:>10}  {f'+{group.hot_dn:.4g}':>14}"
         )
     return lines
 
