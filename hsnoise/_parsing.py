@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def or_near(word: str, known: Iterable[str]) -> str:
-    """ "; did you mean ...?" with the known name that comes nearest; empty if none is near."""
+    """A question for the known name that comes nearest, to stand behind an error; empty if none is near."""
     near = difflib.get_close_matches(word.lower(), list(known), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 

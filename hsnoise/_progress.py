@@ -22,6 +22,7 @@ from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
 EVERY_S = 30.0  # where there is no terminal
+SPINNER = 2  # columns, with the space behind it
 LEAST_S = 5.0  # of a stage, before its rate says when it ends
 _COUNTED = re.compile(r"(.*): (\d+)(?: of (\d+))?")
 
@@ -53,17 +54,23 @@ class Account:
             self._done, self._total = max(self._done, done), total  # threads may overtake each other
         return is_new
 
-    def line(self) -> str:
-        """ "[2:30] Adding row_noise, draw 34 of 60; error 26.3; about 1:10 left"."""
+    def line(self, columns: int | None = None) -> str:
+        """For example "[2:30] Adding row_noise, draw 34 of 60; error 26.3; about 1:10 left".
+
+        What stands in the middle is left out if the line would have more than so many columns.
+        """
         what, *beside = self._stage.split("; ")
         if self._done:
             what += f", {self._of} {self._done}" + (f" of {self._total}" if self._total else "")
-        return "; ".join([f"[{_clock(self._clock() - self._began)}] {what}", *beside, *self._left()])
+        first, left = f"[{_clock(self._clock() - self._began)}] {what}", self._left()
+        whole = "; ".join([first, *beside, *left])
+        return whole if columns is None or len(whole) <= columns else "; ".join([first, *left])
 
     def _left(self) -> list[str]:
         """The time that is left, if it can be told, in words."""
         now = self._clock()
-        until_end = [] if self._ends is None else [max(self._ends - now, 0.0)]
+        # What is finished in any case goes on beyond the end, nobody knows how long.
+        until_end = [] if self._ends is None or self._ends <= now else [self._ends - now]
         taken = now - self._stage_began
         if self._total > self._done > 0 and taken >= LEAST_S:
             return [f"about {_clock(min([taken / self._done * (self._total - self._done), *until_end]))} left"]
@@ -75,7 +82,9 @@ def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator
     """Say what is being done; the value takes the sentences of what is done next (see `Account`)."""
     account, console = Account(stage, minutes, of), Console(stderr=True)
     if console.is_terminal:
-        with Progress(SpinnerColumn(), _Line(account), console=console, transient=True) as progress:
+        with Progress(
+            SpinnerColumn(), _Line(account, console.width - SPINNER), console=console, transient=True
+        ) as progress:
             progress.add_task("", total=None)
             yield account.tell
         return
@@ -112,12 +121,12 @@ def fit_with_progress(
 class _Line(ProgressColumn):
     """The line of an account."""
 
-    def __init__(self, account: Account):
+    def __init__(self, account: Account, columns: int):
         super().__init__()
-        self._account = account
+        self._account, self._columns = account, columns
 
     def render(self, task: Task) -> Text:
-        return Text(self._account.line(), no_wrap=True, overflow="ellipsis")
+        return Text(self._account.line(self._columns), no_wrap=True, overflow="ellipsis")
 
 
 @contextmanager

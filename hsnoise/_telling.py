@@ -22,7 +22,6 @@ from hsnoise.result import TITLES, FitResult
 from hsnoise.structure import explained
 
 LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
-FEWEST_LINES = 20
 OPTIONS = {
     "exposure_s": "--exposure",
     "black_level": "--black-level",
@@ -71,8 +70,9 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     notes, rest = ([_printed(Text(in_options(one)), console) for one in part] for part in (page.notes, page.rest))
     last = [_printed(Text(one), console) for one in foot]
     everything = [*head, *tables, *notes, *rest]
-    room = max(FEWEST_LINES, min(LINES, console.height - 1)) - _count(last) - 1
-    shown = everything if verbose else _fitting(head, tables, notes, room)
+    room = LINES - _count(last) - 1
+    small = min(room, console.height - 1 - _count(last) - 1)
+    shown = everything if verbose else _fitting(head, tables, notes, room, small)
     left_out = _count(everything) - _count(shown)
     more = [f"{left_out} more line{'s' if left_out > 1 else ''}: --verbose"] if left_out else []
     # In one piece: a reader that is gone is no reason to break off in the middle.
@@ -207,10 +207,13 @@ def _count(some: Iterable[Printed]) -> int:
     return sum(lines for _, lines in some)
 
 
-def _fitting(head: list[Printed], tables: list[Printed], notes: list[Printed], room: int) -> list[Printed]:
-    """Whole sentences and rows that fit: of the head, what half of the room holds; then the tables; then notes."""
+def _fitting(head: list[Printed], tables: list[Printed], notes: list[Printed], room: int, small: int) -> list[Printed]:
+    """Whole sentences and rows that fit: of the head, what half of the room holds; then the tables; then notes.
+
+    small: room on a small screen. Notes wait there; a table is rather scrolled than cut.
+    """
     shown, used = head[:1], head[0][1]
-    for part, most in ((head[1:], room // 2), (tables, room), (notes, room)):
+    for part, most in ((head[1:], room // 2), (tables, room), (notes, small)):
         for one in part:
             if used + one[1] > most:
                 break

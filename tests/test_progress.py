@@ -51,8 +51,15 @@ def test_the_time_left_is_at_most_what_the_limit_leaves(clock):
     assert account.line().endswith("; at most 1:30 left")
     account.tell("Looking: 1 of 1000")
     assert account.line().endswith("; about 1:30 left")
+    account.tell("Fitting")
     clock.now_s += 1000
-    assert account.line().endswith("; about 0:00 left")
+    assert account.line() == "[17:10] Fitting"
+
+
+def test_a_narrow_terminal_has_the_time_rather_than_the_error(clock):
+    account = Account("Step 1: looking; error 26.3", minutes=2, clock=clock)
+    assert account.line(80) == "[0:00] Step 1: looking; error 26.3; at most 2:00 left"
+    assert account.line(40) == "[0:00] Step 1: looking; at most 2:00 left"
 
 
 def test_each_stage_is_one_line(capsys):

@@ -118,8 +118,8 @@ class _Limit:
         """How the story ends where a limit is reached; empty if none is."""
         if additions < self.steps and not self.is_over:
             return ""
-        limit = f"{additions} additions" if additions >= self.steps else f"{self.minutes:g} minutes"
-        return f"It stopped after {limit}; something may be left."
+        limit, what = (additions, "addition") if additions >= self.steps else (self.minutes, "minute")
+        return f"It stopped after {limit:g} {what}{'' if limit == 1 else 's'}; something may be left."
 
 
 NO_LIMIT = _Limit(0.0, np.inf, MOST_STEPS)
@@ -168,7 +168,7 @@ class _Work:
 
     def step(self, result: FitResult, added: str | None, steps: Sequence[Step]) -> Step:
         """The step behind `steps`."""
-        tick = self.counter(_stage("comparing with the model's own samples", steps), DRAWS)
+        tick = self.counter(_stage("comparing with the model's samples", steps), DRAWS)
         comparison = compare(result.params, self.fitted, seed=self.seed, progress=tick)
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())

@@ -32,7 +32,7 @@ def clock(monkeypatch):
 
 @pytest.fixture
 def stack(rng):
-    counts = rng.poisson(80, (2, 4, 16, 16)).astype(np.uint16)
+    counts = rng.poisson(80, (2, 4, 32, 32)).astype(np.uint16)
     return hsnoise.FrameStack(counts, [0.1, 0.2], cfa="RGGB")
 
 
