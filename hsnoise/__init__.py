@@ -6,7 +6,7 @@ import logging
 from importlib import import_module
 from typing import Any
 
-from hsnoise import cameras, effects, examples
+from hsnoise import _interrupting, cameras, effects, examples  # noqa: F401  the first is for Ctrl-C during the others
 from hsnoise.budget import NoiseBudget, budget
 from hsnoise.criticism import compare, diagnose, improve
 from hsnoise.effects import AbstractEffect, Stage, param

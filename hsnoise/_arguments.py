@@ -96,10 +96,10 @@ def callback(name: str, function: Any) -> Callable[..., Any]:
     return function or (lambda *told: None)
 
 
-def counter(say: Callable[[str], Any], text: str) -> Callable[[], None]:
-    """A function that says `text` and how often it was called: "Drawing: 12"."""
-    numbers = itertools.count(1)
-    return lambda: say(f"{text}: {next(numbers)}")
+def counter(say: Callable[[str], Any], text: str, total: int | None = None) -> Callable[[], None]:
+    """A function that says `text` and how often it was called: "Drawing: 12", "Drawing: 12 of 40"."""
+    numbers, of = itertools.count(1), "" if total is None else f" of {total}"
+    return lambda: say(f"{text}: {next(numbers)}{of}")
 
 
 def warn_of_a_mosaic(frame: np.ndarray) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import hsnoise.io
 from hsnoise._frames import LazyFrames
 from hsnoise._options import CAMERAS
+from hsnoise._parsing import or_near
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
@@ -57,8 +58,8 @@ def _in_words(value: Any) -> str:
     if isinstance(value, tuple | list):
         spans = all(isinstance(one, tuple) for one in value)
         ends = [":".join("" if end is None else str(end) for end in one) for one in value] if spans else value
-        return ",".join(one if isinstance(one, str) else f"{one:g}" for one in ends)
-    return value if isinstance(value, str) else f"{value:g}"
+        return ",".join(one if isinstance(one, str) else f"{one:.10g}" for one in ends)
+    return value if isinstance(value, str) else f"{value:.10g}"
 
 
 def _tell_exposures(stack: FrameStack) -> None:
@@ -83,7 +84,8 @@ def model_of(name: str, argument: str = "model") -> NoiseModel:
     if name in CAMERAS:
         return CAMERAS[name]()
     if not Path(name).is_file():
-        raise ValueError(f"{argument}: expected a model.json or one of {', '.join(CAMERAS)}, and there is no {name}")
+        expected = f"expected a model.json or one of {', '.join(CAMERAS)}"
+        raise ValueError(f"{argument}: {expected}, and there is no {name}{or_near(name, CAMERAS)}")
     return NoiseModel.load(name)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hsnoise._output import FRAME_FORMATS
+from hsnoise._parsing import Parser, cfa, count, list_of_seconds, minutes, numbers, overscan, positive, roi
 from hsnoise._types import BAYER_CFAS, SHUTTERS
 from hsnoise.cameras import canon_5d3, grasshopper3
 from hsnoise.training.options import shape_of, training_arguments
@@ -16,9 +17,9 @@ from hsnoise.training.options import shape_of, training_arguments
 CAMERAS = {"canon_5d3": canon_5d3, "grasshopper3": grasshopper3}
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The parser of all commands; `command` names which, or is None."""
-    top = argparse.ArgumentParser(
+    top = Parser(
         prog="hsnoise",
         description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
         "the same noise. New here? Run: hsnoise demo",
@@ -32,6 +33,8 @@ def parser() -> argparse.ArgumentParser:
     _sample_arguments(commands)
     _enhance_arguments(commands)
     training_arguments(commands)
+    for name in ("demo", "inspect", "fit", "compare", "diagnose", "improve"):
+        commands.choices[name].add_argument("--verbose", action="store_true", help="print all that was found")
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return top
@@ -133,10 +136,15 @@ def _loop_arguments(commands: Any) -> None:
         parser.add_argument(
             "--report", type=Path, metavar="FILE", help="write one page of HTML, figures included: report.html"
         )
-        parser.add_argument("--seed", type=int, default=0, help="of the model's samples (default 0)")
+        parser.add_argument("--seed", type=count, default=0, help="of the model's samples (default 0)")
         if name == "improve":
-            parser.add_argument("--max-minutes", type=float, metavar="M", help="look for nothing more after so long")
-            parser.add_argument("--max-steps", type=int, metavar="N", help="add no more effects than this")
+            parser.add_argument(
+                "--max-minutes",
+                type=minutes,
+                metavar="M",
+                help="end after so long, with what there is then; the first fit is finished in any case",
+            )
+            parser.add_argument("--max-steps", type=count, metavar="N", help="add no more effects than this")
         _capture_arguments(parser)
 
 
@@ -152,10 +160,15 @@ def _method_argument(parser: argparse.ArgumentParser) -> None:
 
 def _capture_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("what the files do not say", "each overrides what the files say")
-    group.add_argument("--exposure", type=_numbers, metavar="S[,S...]", help="exposure in seconds, one or one per file")
+    group.add_argument(
+        "--exposure",
+        type=list_of_seconds,
+        metavar="S[,S...]",
+        help="exposure in seconds, one or one per file: 0.5, 1/30, 20ms",
+    )
     group.add_argument("--kind", choices=("dark", "flat"), help="what the frames are (default: dark)")
-    group.add_argument("--cfa", type=_cfa, metavar="CFA", help=f"mono or the Bayer order: {', '.join(BAYER_CFAS)}")
-    group.add_argument("--black-level", type=_numbers, metavar="DN[,DN,DN]", help="one, or one for each of R, G, B")
+    group.add_argument("--cfa", type=cfa, metavar="CFA", help=f"mono or the Bayer order: {', '.join(BAYER_CFAS)}")
+    group.add_argument("--black-level", type=numbers, metavar="DN[,DN,DN]", help="one, or one for each of R, G, B")
     group.add_argument("--white-level", type=float, metavar="DN", help="count at which the sensor saturates")
     group.add_argument(
         "--shutter",
@@ -169,27 +182,29 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait (default: 0)",
     )
-    group.add_argument("--roi", type=_roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
+    group.add_argument("--roi", type=roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
     group.add_argument(
         "--overscan",
-        type=_overscan,
+        type=overscan,
         metavar="auto|R0:R1,C0:C1",
         help="take off rows or columns that see no light: auto, or which, with : for all (:,1024:1050)",
     )
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
-    group.add_argument("--flats-exposure", type=_numbers, metavar="S[,S...]", help="their exposure in seconds")
+    group.add_argument("--flats-exposure", type=list_of_seconds, metavar="S[,S...]", help="their exposure in seconds")
 
 
 def _sample_arguments(commands: Any) -> None:
     text = "Draw raw frames from a noise model: dark frames, or noisy frames of a clean image."
     sample = commands.add_parser("sample", help="make frames with the noise of a camera", description=text)
-    sample.add_argument("model", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}")
+    sample.add_argument(
+        "model", metavar="MODEL", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}"
+    )
     sample.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help=f"file to write: {' '.join(FRAME_FORMATS)}"
     )
-    sample.add_argument("--frames", type=_positive, default=8, metavar="N", help="frames of each exposure (default 8)")
+    sample.add_argument("--frames", type=positive, default=8, metavar="N", help="frames of each exposure (default 8)")
     sample.add_argument(
-        "--exposure", type=_numbers, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
+        "--exposure", type=list_of_seconds, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
     )
     sample.add_argument("--shape", type=shape_of, metavar="ROWSxCOLUMNS", help="of dark frames (default 480x640)")
     sample.add_argument(
@@ -200,7 +215,7 @@ def _sample_arguments(commands: Any) -> None:
     sample.add_argument(
         "--mean-e", type=float, metavar="E", help="scale the clean image to this mean, in photoelectrons"
     )
-    sample.add_argument("--seed", type=int, default=0, help="same seed, same frames (default 0)")
+    sample.add_argument("--seed", type=count, default=0, help="same seed, same frames (default 0)")
 
 
 def _enhance_arguments(commands: Any) -> None:
@@ -221,11 +236,14 @@ def _enhance_arguments(commands: Any) -> None:
     )
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
     enhance.add_argument(
-        "--exposure", type=_numbers, metavar="S", help="of raw frames, in seconds (default: what their files say)"
+        "--exposure",
+        type=list_of_seconds,
+        metavar="S",
+        help="of raw frames, in seconds (default: what their files say)",
     )
     enhance.add_argument(
         "--cfa",
-        type=_cfa,
+        type=cfa,
         metavar="CFA",
         help="Bayer order of raw frames (default: what their files say, or else the model's)",
     )
@@ -239,48 +257,8 @@ def _enhance_arguments(commands: Any) -> None:
     )
     enhance.add_argument(
         "--tile",
-        type=_positive,
+        type=positive,
         metavar="PIXELS",
         help="work in tiles of so many (a multiple of the network's stride), in less memory: 256, say",
     )
     enhance.add_argument("--rate", type=float, default=25, help="frames a second of what says none (default 25)")
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a number or several with commas, got {text!r}") from None
-
-
-def _cfa(text: str) -> str:
-    if text.lower() == "mono":
-        return "mono"
-    if text.upper() not in BAYER_CFAS:
-        raise argparse.ArgumentTypeError(f"expected mono or one of {', '.join(BAYER_CFAS)}, got {text!r}")
-    return text.upper()
-
-
-def _positive(text: str) -> int:
-    if not (text.isdigit() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
-    return int(text)
-
-
-def _overscan(text: str) -> str | tuple[Any, Any]:
-    """auto, or spans of rows and columns, None for all."""
-    if text == "auto":
-        return text
-    try:
-        rows, columns = (None if one == ":" else tuple(map(int, one.split(":"))) for one in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected auto or R0:R1,C0:C1 such as :,1024:1050, got {text!r}") from None
-    return rows, columns
-
-
-def _roi(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
-    try:
-        (r0, r1), (c0, c1) = (map(int, span.split(":")) for span in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected R0:R1,C0:C1 such as 0:512,100:612, got {text!r}") from None
-    return (r0, r1), (c0, c1)

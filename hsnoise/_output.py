@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._interrupting import unfinished
+
 FRAME_FORMATS = (".npz", ".npy", ".tif", ".tiff", ".fits")
 _EXPOSURE_TIME_TAG, _RATIONAL = 33434, 5
 
@@ -24,14 +26,12 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
+    with unfinished(temporary):
         with open(temporary, "xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)  # atomic within a directory
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:

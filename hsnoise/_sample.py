@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,6 +18,16 @@ from hsnoise.model import NoiseModel, sample
 from hsnoise.photometry import scale_to_photoelectrons
 
 SAMPLE_SHAPE = (480, 640)
+# What files of other formats than .npz hold of the metadata, and what `hsnoise.load` takes where nothing is said.
+HELD = {".npy": (), ".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
+BARE = {  # Python that reads the counts alone
+    ".npz": "import numpy as np; counts = np.load({})['counts']",
+    ".npy": "import numpy as np; counts = np.load({})",
+    ".tif": "import tifffile; counts = tifffile.imread({})",
+    ".tiff": "import tifffile; counts = tifffile.imread({})",
+    ".fits": "from astropy.io import fits; counts = fits.getdata({})",
+}
+DEFAULTS = {"kind": "dark", "cfa": "mono", "shutter": "rolling"}
 
 
 def run(args: argparse.Namespace) -> None:
@@ -31,16 +42,44 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"--mean-e: expected photoelectrons above 0, got {args.mean_e:g}")
     if args.shape is not None and args.clean is not None:
         raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
-    model = model_of(args.model)
+    model = model_of(args.model, "MODEL")
     exposures_s = args.exposure or [model.exposure_s]
     dark = np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
     clean = dark if args.clean is None else _clean(args.clean, args.mean_e, model)
     counts = draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = metadata_of(model, exposures_s, "flat" if args.clean else "dark")
     write_atomically(args.out, frames_file(suffix, counts, metadata))
+    print("\n".join(_told(args.out, counts, metadata)))
+
+
+def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]:
+    """What was written, in lines, the last one of Python that reads it."""
     n, frames, rows, columns = counts.shape
-    exposed, codes = " and ".join(f"{t:g} s" for t in exposures_s), f"counts {counts.min()} to {counts.max()} DN"
-    print(f"{args.out}: {n * frames} frames of {rows} x {columns} pixels, exposed {exposed}, {codes}")
+    what = f"{metadata['kind']} frame{'s' if n * frames > 1 else ''}"
+    exposed = " and ".join(f"{t:g} s" for t in metadata["exposure_s"])
+    lines = [
+        f"{path}: {n * frames} {what} of {rows} x {columns} pixels, exposed {exposed}",
+        f"counts in DN, {counts.min()} to {counts.max()}, {counts.dtype}; array [exposure, frame, row, column]:"
+        f" {' x '.join(map(str, counts.shape))}",
+    ]
+    if metadata["kind"] == "flat":
+        lines.append('kind "flat": a picture of light, with the dark current added; no dark frames')
+    held = HELD.get(path.suffix.lower(), tuple(metadata))
+    lines.append(f"Beside the counts the file holds {', '.join(held)}" if held else "The file holds counts only")
+    return [*lines, f"In Python: {_reading(path, n * frames, metadata, held)}"]
+
+
+def _reading(path: Path, n_frames: int, metadata: dict[str, Any], held: tuple[str, ...]) -> str:
+    """A line of Python that reads a file: counts alone where `hsnoise.load` would want more than the file holds."""
+    suffix, name = path.suffix.lower(), repr(str(path))
+    if n_frames == 1 or suffix == ".npy":
+        return BARE[suffix].format(name)
+    given = {key: value for key, value in metadata.items() if key not in held and np.any(value != DEFAULTS.get(key))}
+    return f"import hsnoise; stack = hsnoise.load({', '.join([name, *(f'{k}={_value(v)}' for k, v in given.items())])})"
+
+
+def _value(value: Any) -> str:
+    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
 def draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray, seed: int) -> np.ndarray:

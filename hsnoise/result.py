@@ -187,6 +187,7 @@ class FitResult:
 
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(self._title, highlight=False)
         for doubt in self.doubts:
             console.print(f"! {doubt}", highlight=False)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._frames import in_order
+from hsnoise._interrupting import unfinished
 
 VIDEO = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 WRITTEN = tuple(suffix for suffix in VIDEO if suffix != ".webm")  # those that hold H.264
@@ -97,7 +98,7 @@ def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fra
     av = _av(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp{path.suffix}")
     count = 0
-    try:
+    with unfinished(temporary):
         with av.open(str(temporary), "w") as container:
             stream = _stream(container, rate)
             for frame in frames:
@@ -112,8 +113,6 @@ def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fra
                 raise ValueError("frames: expected at least one, got none")
             container.mux(stream.encode())
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return count
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import _options, _output, cli
+from hsnoise import _demo, _options, _output, criticism
 from hsnoise._loading import load_capture
 from hsnoise.cli import main
 from hsnoise.criticism import Comparison, Step, Story
@@ -52,7 +52,7 @@ def fitted(capture) -> Path:
 def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_path, capsys):
     arguments = [str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "loop")]
     assert main(["compare", *arguments, "--model", str(fitted / "model.json"), "--debug"]) == 0
-    assert "1.0: like the model's own samples" in capsys.readouterr().out
+    assert "as close as its own samples" in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "loop").iterdir()] == ["comparison.png"]
     assert main(["compare", *arguments, "--model", "canon_5d3"]) == 2
     assert "--model: made for RGGB" in capsys.readouterr().err
@@ -96,7 +96,7 @@ def test_fit_writes_a_model_a_table_and_figures(fitted):
 def test_fitted_model_can_be_sampled(fitted, tmp_path, capsys):
     out = tmp_path / "frames.npz"
     assert main(["sample", str(fitted / "model.json"), "--out", str(out), "--frames", "2", "--shape", "16x32"]) == 0
-    assert "2 frames of 16 x 32 pixels" in capsys.readouterr().out
+    assert "2 dark frames of 16 x 32 pixels" in capsys.readouterr().out
     stack = hsnoise.load(out)
     assert (stack.n_frames, stack.shape, stack.shutter, stack.black_level) == ((2,), (16, 32), "global", 64.0)
 
@@ -113,13 +113,13 @@ def short_loop(monkeypatch):
         keep(Story((steps[0],), "Not finished."))
         return Story(tuple(steps), "Nothing significant is left.")
 
-    monkeypatch.setattr(hsnoise, "improve", improve)
+    monkeypatch.setattr(criticism, "improve", improve)
 
 
 def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, short_loop):
-    monkeypatch.setattr(cli, "DEMO_FRAMES", 2)
-    monkeypatch.setattr(cli, "DEMO_SHAPE", (32, 64))
-    monkeypatch.setattr(cli, "DEMO_EXPOSURES_S", (0.1, 0.4))
+    monkeypatch.setattr(_demo, "FRAMES", 2)
+    monkeypatch.setattr(_demo, "SHAPE", (32, 64))
+    monkeypatch.setattr(_demo, "EXPOSURES_S", (0.1, 0.4))
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out), "--debug"]) == 0
     said = capsys.readouterr().out
@@ -132,16 +132,18 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 
-def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop):
-    whole = hsnoise.improve
+def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop, capsys):
+    whole = criticism.improve
 
     def broken_off(stack, **keywords):
         whole(stack, **keywords)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(hsnoise, "improve", broken_off)
+    monkeypatch.setattr(criticism, "improve", broken_off)
     arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
     assert main(arguments) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"hsnoise: interrupted; the model so far is in {tmp_path / 'model.json'}"
     assert "Not finished" in (tmp_path / "story.txt").read_text()
     assert "read_noise" in hsnoise.NoiseModel.load(tmp_path / "model.json")
 
@@ -278,7 +280,8 @@ def test_wrong_options_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
-    assert "error:" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.startswith("hsnoise: ") and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", COMMANDS)

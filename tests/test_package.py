@@ -125,7 +125,8 @@ def test_a_folder_of_fits_files_is_fitted_in_three_commands(installed, tmp_path)
 def test_the_readme_runs_from_the_wheel(installed, tmp_path):
     """Each command and each line of Python of the README, in order, where only the wheel is installed."""
     run(installed / "python", "-m", "pip", "install", "-q", "av", cwd=tmp_path)  # the extra for video
-    made = "import hsnoise, shutil; hsnoise.examples.st8('night'); shutil.copytree('night', 'darks'); shutil.move('darks/flat3s', 'flats')"
+    made = "import hsnoise, shutil; hsnoise.examples.st8('night'); shutil.copytree('night', 'darks');"
+    made += " shutil.move('darks/flat3s', 'flats')"
     scene = "; from skimage import data, io; io.imsave('scene.png', data.astronaut()[:192, :256])"
     run(installed / "python", "-c", made + scene, cwd=tmp_path)
     little = {"improve": ["--max-steps", "0"], "demo": ["--max-steps", "0"]}

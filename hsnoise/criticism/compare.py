@@ -79,6 +79,14 @@ class Comparison:
         """The misfit that the worst group takes on the model's own draws, their median: what `error` is measured by."""
         return max(self.groups.values()) / self.error if self.error > 0 else 1.0
 
+    @property
+    def measure(self) -> str:
+        """What the error is, in words."""
+        return (
+            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
+            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}"
+        )
+
     def plot(self):
         """A figure of where the model fails: `hsnoise.plots.comparison`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -98,16 +106,10 @@ class Comparison:
             table.add_row(name, f"{misfit:.2f}")
         return table
 
-    @property
-    def _error_in_words(self) -> str:
-        return (
-            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
-            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}"
-        )
-
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(self._error_in_words, highlight=False)
+        console.print(str(self.conclusion), markup=False, highlight=False)
+        console.print(self.measure, highlight=False)
         console.print(self._misfits())
         for sentence in (*self.worst, *explained(self.worst), *self.skipped):
             console.print(f"- {sentence}", highlight=False)
@@ -118,7 +120,7 @@ class Comparison:
     def _repr_html_(self) -> str:
         return _html.fragment(
             _html.conclusion(self.conclusion),
-            _html.paragraph(self._error_in_words),
+            _html.paragraph(self.measure),
             _html.printed(self._misfits()),
             _html.sentences(self.worst),
             _html.details("About the statistics", _html.sentences((*explained(self.worst), *self.skipped))),

@@ -120,9 +120,9 @@ class Diagnosis:
 
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(self.headline, highlight=False)
+        console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(self._leaders())
-        for sentence in (LEGEND, *self.sentences, self._remains()):
+        for sentence in (LEGEND, *self.sentences, self.remains):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
@@ -130,7 +130,7 @@ class Diagnosis:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        remains = [sentence for sentence in (self._remains(),) if sentence]
+        remains = [sentence for sentence in (self.remains,) if sentence]
         return _html.fragment(
             _html.conclusion(self.conclusion),
             _html.printed(self._leaders()),
@@ -138,8 +138,9 @@ class Diagnosis:
             _html.details("What the columns mean, and what is left", _html.sentences((LEGEND, *remains))),
         )
 
-    def _remains(self) -> str:
-        """What is still off with what is named in the model."""
+    @property
+    def remains(self) -> str:
+        """What is still off with what is named in the model, in a sentence; empty if nothing stands out."""
         if not self.names or not self.unexplained.stands_out:
             return ""
         left, statistics = self.unexplained, "; ".join(self.unexplained.statistics)

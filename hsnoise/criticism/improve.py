@@ -13,7 +13,7 @@ import numpy as np
 from hsnoise._arguments import callback, counter, seed_of, whole_number
 from hsnoise._source import as_stack
 from hsnoise._types import unit_in_words
-from hsnoise.criticism.compare import Comparison, compare
+from hsnoise.criticism.compare import DRAWS, Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
@@ -63,11 +63,12 @@ def improve(
             FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
         candidates: effects of your own that may be added, too.
-        max_minutes: after which no further effect is looked for; None: as long as it takes.
+        max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
+            fit is finished in any case); None: as long as it takes.
         max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
-        seed: of all draws. progress: called with a sentence at each stage, and again, with a colon and a number behind
-            it, after each capture that is drawn. keep: called with the story so far, after each model that is kept, so
-            that nothing is lost.
+        seed: of all draws. progress: called with a sentence at each stage, "Step 1: adding row_noise; error 26.3", and
+            again after each capture that is drawn, with a colon, its number, and "of 40" if it is known how many there
+            will be. keep: called with the story so far, after each model that is kept, so that nothing is lost.
 
     Raises:
         FileNotFoundError, TypeError, ValueError: bad input, before any long work.
@@ -77,34 +78,26 @@ def improve(
     fitted, held_out = split_frames(darks_of(stack), stack)
     _check_start(model, candidates, fitted)
     limit = _Limit.of(max_minutes, max_steps)
-    work, split = _Work(fitted, held_out, seed, tell), told_of(fitted, held_out)
+    work, split = _Work(fitted, held_out, seed, tell, limit), told_of(fitted, held_out)
     work.say("Fitting the first model")
-    steps = work.begun(fit(fitted, model=model))
+    steps = replace(work, limit=NO_LIMIT).begun(fit(fitted, model=model))
     measured = len(steps)
-    while True:
-        if reached := limit.reached(len(steps) - measured):
-            return _ended(steps, f"It stopped after {reached}; something may be left.", split)
-        last = steps[-1]
+    while not (ended := limit.reached(len(steps) - measured)):
         keep(Story(tuple(steps), UNFINISHED, split))
-        own = [c for c in candidates if c.name not in last.fit.params]
-        tick = counter(tell, "Looking for what is missing")
-        found = diagnose(last.fit, fitted, candidates=own, seed=seed + 1000, progress=tick)
-        steps[-1] = last = replace(last, diagnosis=found)
-        nearest = _nearest(found)
-        if nearest and _is_too_little(nearest, steps):
-            return _ended(steps, _would_be_next(nearest[0], last.comparison), split)
-        if not nearest:
-            return _ended(steps, _end(found, last.comparison), split)
-        step, refused = work.first_that_holds(nearest, steps)
-        if step is None:
-            return _ended(steps, _left_out(refused, found, last.comparison), split)
-        steps.append(step)
-
-
-def _ended(steps: list[Step], why: str, split: str) -> Story:
-    story = Story(tuple(steps), why, split)
+        own = [c for c in candidates if c.name not in steps[-1].fit.params]
+        try:
+            ended = work.turn(steps, own)
+        except _TimeIsUp:
+            continue
+        if ended:
+            break
+    story = Story(tuple(steps), ended, split)
     log.info("Improved: %s", story.conclusion)
     return story
+
+
+class _TimeIsUp(Exception):
+    """The minutes of a limit are over, in the middle of a step."""
 
 
 @dataclass(frozen=True)
@@ -124,40 +117,82 @@ class _Limit:
         steps = MOST_STEPS if max_steps is None else whole_number("max_steps", max_steps, 0)
         return _Limit(time.monotonic(), minutes, steps)
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the minutes have passed."""
+        return time.monotonic() - self.began_s > 60 * self.minutes
+
     def reached(self, additions: int) -> str:
-        """Which limit is reached, in words; empty if none."""
-        if additions >= self.steps:
-            return f"{additions} additions"
-        return f"{self.minutes:g} minutes" if time.monotonic() - self.began_s > 60 * self.minutes else ""
+        """How the story ends where a limit is reached; empty if none is."""
+        if additions < self.steps and not self.is_over:
+            return ""
+        limit, what = (additions, "addition") if additions >= self.steps else (self.minutes, "minute")
+        return f"It stopped after {limit:g} {what}{'' if limit == 1 else 's'}; something may be left."
+
+
+NO_LIMIT = _Limit(0.0, np.inf, MOST_STEPS)
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What every step is made of: frames to fit, frames held out, the seed, and whom to tell."""
+    """What every step is made of: frames to fit, frames held out, the seed, whom to tell, and when to end."""
 
     fitted: FrameStack
     held_out: FrameStack | None
     seed: int
     tell: Callable[[str], None]
+    limit: _Limit = NO_LIMIT
 
     def say(self, text: str) -> None:
         """Tell of a stage, and log it."""
         log.info("%s", text)
         self.tell(text)
 
-    def step(self, result: FitResult, added: str | None, before: Step | None) -> Step:
-        self.say("Comparing with the model's own samples")
-        comparison = compare(result.params, self.fitted, seed=self.seed)
+    def turn(self, steps: list[Step], own: Sequence[AbstractEffect]) -> str:
+        """Diagnose the last step, and append one more; if there is none, why the story ends.
+
+        Raises _TimeIsUp at the first draw after the limit: `steps` are as they were then, but for a diagnosis.
+        """
+        last = steps[-1]
+        tick = self.counter(_stage("looking for what is missing", steps))
+        found = diagnose(last.fit, self.fitted, candidates=own, seed=self.seed + 1000, progress=tick)
+        steps[-1] = last = replace(last, diagnosis=found)
+        nearest = _nearest(found)
+        if not nearest:
+            return _end(found, last.comparison)
+        if _is_too_little(nearest, steps):
+            return _would_be_next(nearest[0], last.comparison)
+        step, refused = self.first_that_holds(nearest, steps)
+        if step is None:
+            return _left_out(refused, found, last.comparison)
+        steps.append(step)
+        return ""
+
+    def counter(self, text: str, total: int | None = None) -> Callable[[], None]:
+        """Says the number of each draw, and raises _TimeIsUp at the first one after the limit."""
+        count = counter(self.tell, text, total)
+
+        def tick() -> None:
+            if self.limit.is_over:
+                raise _TimeIsUp
+            count()
+
+        return tick
+
+    def step(self, result: FitResult, added: str | None, steps: Sequence[Step]) -> Step:
+        """The step behind `steps`."""
+        tick = self.counter(_stage("comparing with the model's samples", steps), DRAWS)
+        comparison = compare(result.params, self.fitted, seed=self.seed, progress=tick)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
-        return Step(result, comparison, None, added, unseen, () if before is None else _moved(before.fit, result))
+        return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
 
     def begun(self, first: FitResult) -> list[Step]:
         """The first steps: the paper's model, then one by one what its fit measured beyond it."""
-        steps = [self.step(first.without(first.added), None, None)]
+        steps = [self.step(first.without(first.added), None, [])]
         for i, name in enumerate(first.added):
-            self.say(f"Adding {name}, as measured")
-            steps.append(self.step(first.without(first.added[i + 1 :]), name, steps[-1]))
+            self.say(_stage(f"adding {name}, as measured", steps))
+            steps.append(self.step(first.without(first.added[i + 1 :]), name, steps))
         return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
 
     def first_that_holds(
@@ -195,19 +230,28 @@ class _Work:
         """
         fits: list[FitResult] = []
         for effect in _sides(candidate.effect):
-            text = f"Adding {effect.name}" if effect is candidate.effect else "The same on the other side of the gain"
+            is_first = effect is candidate.effect
+            text = _stage(f"adding {effect.name}" if is_first else "the same on the other side of the gain", steps)
             self.say(text)
             try:
-                fits.append(_fit_with(effect, steps, self.fitted, counter(self.tell, text)))
+                fits.append(_fit_with(effect, steps, self.fitted, self.counter(text)))
             except (RuntimeError, ValueError) as error:
                 self.say(f"{effect.name} cannot be fitted here: {error}")
         if not fits:
             return None
         if len(fits) == 1:
-            return self.step(fits[0], candidate.name, steps[-1])
+            return self.step(fits[0], candidate.name, steps)
         values = [log_likelihood(one.params, self.fitted, self.seed) for one in fits]
-        step = self.step(fits[int(np.argmax(values))], candidate.name, steps[-1])
+        step = self.step(fits[int(np.argmax(values))], candidate.name, steps)
         return replace(step, ahead=abs(values[0] - values[1]))
+
+
+def _stage(what: str, steps: Sequence[Step]) -> str:
+    """What is being done for the step behind `steps`, and what became of the error until now."""
+    errors = [number(step.comparison.error) for step in steps]
+    return f"Step {len(steps)}: {what}" + (
+        f"; error {' -> '.join(dict.fromkeys([errors[0], errors[-1]]))}" if errors else ""
+    )
 
 
 def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:

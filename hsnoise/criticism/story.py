@@ -114,6 +114,36 @@ class Story:
         """`error` of each step."""
         return tuple(step.comparison.error for step in self.steps)
 
+    @property
+    def details(self) -> tuple[str, ...]:
+        """What was added in each step, why, how large it is, and what else moved, in sentences."""
+        told = []
+        for i, step in enumerate(self.steps):
+            reason = self._reason(i)
+            told += [f"- {reason}"] if reason else []
+            told += [f"  {sentence}" for sentence in (*step.sizes, *step.moved)]
+        return tuple(told)
+
+    def _reason(self, i: int) -> str:
+        """Why step `i` was taken; empty for the first."""
+        step, before = self.steps[i], self.steps[i - 1]
+        if not step.added:
+            return ""
+        errors = f"{before.comparison.error:.2f} -> {step.comparison.error:.2f}"
+        return (
+            f"Step {i}: added {step.added}, because {_because(before, step)}; error {errors}{together(before, step)}."
+        )
+
+    @property
+    def _closing(self) -> tuple[str, ...]:
+        """How it ended, and what to bear in mind."""
+        return tuple(sentence for sentence in (self.ended, self.care, self.split) if sentence)
+
+    @property
+    def care(self) -> str:
+        """What to mind of the last fit; empty if it converged."""
+        return "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+
     def plot(self):
         """A figure of the error falling: `hsnoise.plots.story`."""
         from hsnoise import plots  # matplotlib is slow to import
@@ -138,33 +168,11 @@ class Story:
             table.add_row(str(i), added, f"{error:.2f}", "" if np.isnan(held_out) else f"{held_out:.1f}", worst)
         return table
 
-    def _reason(self, i: int) -> str:
-        """Why step `i` was taken; empty for the first."""
-        step, before = self.steps[i], self.steps[i - 1]
-        if not step.added:
-            return ""
-        errors = f"{before.comparison.error:.2f} -> {step.comparison.error:.2f}"
-        return (
-            f"Step {i}: added {step.added}, because {_because(before, step)}; error {errors}{together(before, step)}."
-        )
-
-    @property
-    def _closing(self) -> list[str]:
-        """How it ended, and what to bear in mind."""
-        care = "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
-        return [sentence for sentence in (self.ended, care, self.split) if sentence]
-
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(self._table())
-        for i, step in enumerate(self.steps):
-            reason = self._reason(i)
-            if reason:
-                console.print(f"- {reason}", highlight=False)
-            for sentence in (*step.sizes, *step.moved):
-                console.print(f"  {sentence}", highlight=False)
-        for sentence in self._closing:
-            console.print(sentence, highlight=False)
+        console.print(str(self.conclusion), self._table(), sep="\n", highlight=False, markup=False)
+        for sentence in (*self.details, *self._closing):
+            console.print(sentence, highlight=False, markup=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__

@@ -21,7 +21,7 @@ from hsnoise.inspection._verdict import about_growth, judged
 from hsnoise.stack import FrameStack
 
 MOST_ROWS = 12  # of the printed budget
-HEADINGS = ("kind", "exposure / s", "frames", "degrees C", "level / DN", "noise / DN", "hottest 0.1 % / DN")
+HEADINGS = ("kind", "exposure / s", "frames", "degrees C", "level / DN", "noise / DN", "top 0.1 % / DN")
 FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is named
 FEW_CODES = 0.5  # DN of noise below which counts are too coarse
 
@@ -57,18 +57,22 @@ class Inspection:
             return Conclusion(Light.RED, self.verdict)
         return Conclusion(Light.AMBER if self.findings else Light.GREEN, self.verdict)
 
-    def __str__(self) -> str:
+    @property
+    def parts(self) -> dict[str, str]:
+        """What is printed, by name: the capture, its groups, what is odd, the budget, what can be had, what is next."""
         head, levels, *_ = repr(self.stack).splitlines()
-        parts = [
-            f"{head.replace('FrameStack: ', '')}\n{levels}",
-            "\n".join(_table(self.groups)),
-            _listed("Read as", self.stack.assumed),
-            _listed("Odd", self.findings) or "Nothing odd was found.",
-            "\n".join(_noise_lines(self.budget)),
-            _listed("What can be determined", self.determined),
-            f"{self.verdict}\nNext: {self.next_capture}",
-        ]
-        return "\n\n".join(part for part in parts if part)
+        return {
+            "capture": f"{head.replace('FrameStack: ', '')}\n{levels}",
+            "groups": "\n".join(_table(self.groups)),
+            "assumed": _listed("Read as", self.stack.assumed),
+            "odd": _listed("Odd", self.findings) or "Nothing odd was found.",
+            "budget": "\n".join(_noise_lines(self.budget)),
+            "determined": _listed("What can be determined", self.determined),
+            "next": f"Next: {self.next_capture}",
+        }
+
+    def __str__(self) -> str:
+        return "\n\n".join(part for part in (str(self.conclusion), *self.parts.values()) if part)
 
     __repr__ = __str__
 

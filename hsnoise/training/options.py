@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hsnoise._parsing import seconds
 from hsnoise.training.noisy import NOISES, OPTICS
 from hsnoise.training.presets import PRESETS
 
@@ -77,7 +78,7 @@ def _light_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     add("--lux", type=pair, metavar="LOW,HIGH", help=f"illuminance of the scene (default: {default})")
     add("--white-e", type=pair, metavar="LOW,HIGH", help="or photoelectrons of white")
     exposure = "of a video frame, s, with a model.json (default: the model's own)"
-    add("--exposure", type=float, metavar="S", help=exposure)
+    add("--exposure", type=seconds, metavar="S", help=exposure)
 
 
 def pair(text: str) -> tuple[float, float]:

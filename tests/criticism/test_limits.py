@@ -1,0 +1,92 @@
+"""Where `improve` ends by its limits, and what it says on the way."""
+
+from __future__ import annotations
+
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise.criticism.improve import _stage, _Work
+from hsnoise.criticism.story import Step
+
+improve = importlib.import_module("hsnoise.criticism.improve")
+
+
+def step(error: float) -> Step:
+    fit = SimpleNamespace(params=hsnoise.cameras.grasshopper3())
+    return Step(fit, SimpleNamespace(error=error), None, None, float("nan"), ())
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time, s, that passes when it is told to."""
+    now = SimpleNamespace(s=1000.0)
+    monkeypatch.setattr(improve.time, "monotonic", lambda: now.s)
+    monkeypatch.setattr(_Work, "begun", lambda self, first: [step(26.34)])
+    monkeypatch.setattr(improve, "fit", lambda *_, **__: None)
+    return now
+
+
+@pytest.fixture
+def stack(rng):
+    counts = rng.poisson(80, (2, 4, 32, 32)).astype(np.uint16)
+    return hsnoise.FrameStack(counts, [0.1, 0.2], cfa="RGGB")
+
+
+def test_the_time_ends_a_diagnosis_at_the_next_draw(clock, stack, monkeypatch):
+    drawn, said = [], []
+
+    def diagnose(*_, progress, **__):
+        for i in range(100):
+            drawn.append(i)
+            clock.s += 30
+            progress()
+
+    monkeypatch.setattr(improve, "diagnose", diagnose)
+    story = hsnoise.improve(stack, max_minutes=2, progress=said.append)
+    assert len(drawn) == 5  # the first draw beyond two minutes
+    assert story.ended == "It stopped after 2 minutes; something may be left."
+    assert story.errors == (26.34,) and not story.finished
+    assert said[1:3] == [f"Step 1: looking for what is missing; error 26.3: {i}" for i in (1, 2)]
+
+
+def test_the_time_ends_a_fit_at_the_next_draw(clock, stack, monkeypatch):
+    tried = []
+
+    def first_that_holds(self, nearest, steps):
+        tried.append(nearest)
+        clock.s += 121
+        self.counter("Step 1: adding row_noise", 40)()
+
+    nearest = (SimpleNamespace(name="row_noise", score=99.0),)
+    monkeypatch.setattr(improve, "diagnose", lambda *_, **__: "found")
+    monkeypatch.setattr(improve, "_nearest", lambda found: nearest)
+    monkeypatch.setattr(_Work, "first_that_holds", first_that_holds)
+    story = hsnoise.improve(stack, max_minutes=2)
+    assert tried == [nearest] and story.errors == (26.34,)
+    assert story.steps[0].diagnosis == "found" and story.ended.startswith("It stopped after 2 minutes")
+
+
+def test_without_a_limit_nothing_is_ended(clock, stack, monkeypatch):
+    def diagnose(*_, progress, **__):
+        clock.s += 1e9
+        progress()
+        return SimpleNamespace(verdict="nothing missing", best=None)
+
+    monkeypatch.setattr(improve, "diagnose", diagnose)
+    assert "No effect stands out" in hsnoise.improve(stack).ended
+
+
+@pytest.mark.parametrize("minutes", [0, -1, float("nan")])
+def test_a_limit_that_is_none_is_refused(minutes, stack):
+    with pytest.raises(ValueError, match="max_minutes: expected minutes above 0, got"):
+        hsnoise.improve(stack, max_minutes=minutes)
+
+
+def test_a_stage_tells_its_step_and_the_error_until_now():
+    assert _stage("comparing", []) == "Step 0: comparing"
+    assert _stage("looking", [step(26.34)]) == "Step 1: looking; error 26.3"
+    assert _stage("looking", [step(26.34), step(9.0), step(1.59)]) == "Step 3: looking; error 26.3 -> 1.59"
