@@ -112,13 +112,16 @@ def _demo(args: argparse.Namespace) -> None:
         return
     print(f"{stack}\nFitting them, finding what the model lacks, and fitting again: a few minutes ...")
     limit = None if truth is not None else DEMO_MINUTES
-    story = _improve_with_progress(stack, DEMO_SEED, args.out, source, max_minutes=limit)
+    page = args.out / "report.html"
+    story = _improve_with_progress(stack, DEMO_SEED, args.out, source, page, max_minutes=limit)
     _tell(story, args.out, source, truth)
+    report.write_report(page, story, stack, files=args.data or (), seed=DEMO_SEED)
     if truth is not None:
         print("off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read")
         print("noise are off together: their ratios are known better than themselves.")
         print(f"Hidden in these frames was {DEMO_HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
+    print(f"All of this is on one page, for a browser: {page}")
     print(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
 
 
@@ -213,7 +216,7 @@ def _improve(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
-    story = _improve_with_progress(stack, args.seed, args.out, source, start, **limits)
+    story = _improve_with_progress(stack, args.seed, args.out, source, args.report, start, **limits)
     _tell(story, args.out, source, None)
     _write_report(args, story, stack)
 
@@ -244,13 +247,23 @@ def _load(args: argparse.Namespace) -> FrameStack:
 
 
 def _improve_with_progress(
-    stack: FrameStack, seed: int, out: Path, source: dict[str, Any], start: NoiseModel | None = None, **limits: Any
+    stack: FrameStack,
+    seed: int,
+    out: Path,
+    source: dict[str, Any],
+    page: Path | None,
+    start: NoiseModel | None = None,
+    **limits: Any,
 ) -> Story:
-    """The loop; each model that it keeps is written to `out`."""
+    """The loop; each model that it keeps is written to `out`, and the story so far to `page`, if there is to be one."""
+
+    def keep(story: Story) -> None:
+        _keep(story, out, source)
+        if page is not None:
+            report.write_report(page, story, stack, files=source.get("files", ()), seed=seed)
+
     with busy("Fitting the first model") as say:
-        return hsnoise.improve(
-            stack, model=start, seed=seed, progress=say, keep=lambda story: _keep(story, out, source), **limits
-        )
+        return hsnoise.improve(stack, model=start, seed=seed, progress=say, keep=keep, **limits)
 
 
 def _show(found, path: Path) -> None:

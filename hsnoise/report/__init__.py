@@ -15,6 +15,8 @@ from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 
+Found = Comparison | Diagnosis | Story | FitResult
+
 __all__ = ["check_path", "page", "write_report"]
 
 
@@ -35,7 +37,7 @@ def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None
 
 
 def page(
-    found: Comparison | Diagnosis | Story | FitResult,
+    found: Found,
     stack: FrameStack,
     *,
     fit: FitResult | NoiseModel | None = None,
@@ -67,7 +69,7 @@ def page(
     return render(context(found, stack, fit, comparison, files, seed), found, stack, fit, seed)
 
 
-def write_report(path: str | os.PathLike, found: Comparison | Diagnosis | Story | FitResult, stack: FrameStack, **keywords) -> None:
+def write_report(path: str | os.PathLike, found: Found, stack: FrameStack, **keywords) -> None:
     """Write the page of `page(found, stack, **keywords)` to a file.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
@@ -56,6 +57,7 @@ def context(
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
         "conclusion": said,
         "light": LIGHTS[said.light],
+        "said": _apart(said.sentence),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
         "doubts": fit.doubts if isinstance(fit, FitResult) else (),
@@ -85,6 +87,15 @@ def conclusion(found: Comparison | Diagnosis | Story | FitResult, comparison: Co
         return Conclusion(Light.RED, text)
     after = f" ({error})" if found.verdict == "nothing missing" else f"; {error}, {YARDSTICK}"
     return Conclusion(said.light, f"{said.sentence.removesuffix('.')}{after}.")
+
+
+def _apart(sentence: str) -> tuple[str, str]:
+    """A conclusion as what is read first, up to its first full stop or semicolon, and the rest."""
+    found = re.match(r"(.+?[.;]) (.+)", sentence)
+    if found is None:
+        return sentence, ""
+    first, rest = found.groups()
+    return first.replace(";", "."), rest[0].upper() + rest[1:]
 
 
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
@@ -174,14 +185,14 @@ def _along(value: float, low: float, high: float) -> str:
 
 
 def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Rows of the ranking table; `width` of a bar on a logarithmic scale, from a score of 1."""
+    """Rows of the ranking table; `width` of the bar of a score, in percent of the width."""
     shown = diagnosis.ranking[:MOST_CANDIDATES]
-    largest = max(10.0, *(c.score for c in shown))
+    largest = max(10.0, *(c.score for c in shown))  # what chance gives makes no long bar
     return [
         {
             "name": c.name,
             "score": f"{c.score:z.1f}",
-            "width": _along(c.score, 1.0, largest),
+            "width": f"{100 * max(c.score / largest, 0.005):.2f}%",
             "p": c.chance,
             "misfit": f"{c.misfit:z.1f}",
             "named": c.name in diagnosis.names,

@@ -98,7 +98,7 @@ def budget_panels(near: Middle, models: list[str]) -> dict[str, Figure]:
         return {}
     rows = [of for of in zip(*(one.rows for one in budgets), strict=True) if of[0].n_frames > 1]
     sigmas = [np.sqrt(max(c.variance_dn2, 0)) for of in rows for row in of for c in row.components.values()]
-    sigmas = [sigma for sigma in sigmas if sigma > 0]
+    sigmas = [sigma for sigma in sigmas if sigma > 0] or [1.0]  # frames without any noise
     limits = max(0.5 * min(sigmas), 1e-4 * max(sigmas)), 2 * max(sigmas)
     return {f"{_kind_of(of[0])}, noise budget": budget_panel(of, models, limits) for of in rows}
 

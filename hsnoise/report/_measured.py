@@ -63,14 +63,17 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = F
     """
     check_fits(model, stack)
     darks = _darks(stack)
-    one = darks.select(exposures=[_extreme(darks, shortest)])
+    first = int(np.argmin(darks.exposure_s) if shortest else np.argmax(darks.exposure_s))
+    # A stack of a single frame would be refused.
+    chosen = [first] if darks.n_frames[first] > 1 else [first, *(i for i in range(darks.n_exposures) if i != first)]
+    part = darks.select(exposures=chosen)
     seeds = [seed + SEED_APART + i for i in range(DRAWS)]
-    drawn = in_threads(lambda number: _frames(draw_capture(number, model, one)), seeds)
-    return Shown(float(one.exposure_s[0]), one.cfa, one.channels, _frames(one), drawn)
+    drawn = in_threads(lambda number: _frames(draw_capture(number, model, part)), seeds)
+    return Shown(float(part.exposure_s[0]), part.cfa, part.channels, _frames(part), drawn)
 
 
 def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shortest: bool = False) -> Middle:
-    """The dark exposure that is shown, the brightest flat, and of a sensor without colours the opposite exposure."""
+    """The dark exposure that is shown, the brightest flat, and of a sensor without colours the other extreme, too."""
     measured = _middle(stack, shortest)
     return Middle(measured, tuple(in_threads(lambda model: draw_capture(seed + SEED_APART, model, measured), models)))
 
@@ -87,14 +90,10 @@ def _middle(stack: FrameStack, shortest: bool) -> FrameStack:
     flats = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
     by_length = sorted(darks, key=lambda i: float(stack.exposure_s[i]), reverse=not shortest)
     chosen = [by_length[0], *sorted(flats, key=lambda i: -float(stack.frame(i, 0).mean()))[:1]]
-    if stack.cfa == "mono" and by_length[-1] not in chosen:
+    if by_length[-1] not in chosen and (stack.cfa == "mono" or stack.n_frames[chosen[0]] == 1):
         chosen.append(by_length[-1])
     part = middle_of(stack.select(exposures=chosen))
     return part.with_counts([_frames(part, i) for i in range(part.n_exposures)], part.window)
-
-
-def _extreme(stack: FrameStack, shortest: bool) -> int:
-    return int(np.argmin(stack.exposure_s) if shortest else np.argmax(stack.exposure_s))
 
 
 def _frames(stack: FrameStack, exposure: int = 0) -> np.ndarray:

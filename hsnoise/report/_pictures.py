@@ -1,4 +1,4 @@
-"""Frames of the page: grey pictures at one stretch, beside each the means of its rows, below it those of its columns."""
+"""Frames of the page: grey pictures at one stretch, each with the means of its rows and of its columns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pictures(frames: Sequence[np.ndarray], cfa: str, whole: tuple[int, int]) -> 
     """
     tile = cfa_tile(cfa)
     level = np.zeros(frames[0].shape)
-    for r, c in np.ndindex(len(tile), len(tile)):
+    for r, c in np.ndindex(*tile.shape):
         planes = (slice(r, None, len(tile)), slice(c, None, len(tile)))
         level[planes] = np.median(frames[0][planes])
     above = [frame - level for frame in frames]
@@ -32,7 +32,7 @@ def pictures(frames: Sequence[np.ndarray], cfa: str, whole: tuple[int, int]) -> 
     high = max(high, low + 1)
     lines = [[_lines(frame, axis, len(tile)) for axis in (0, 1)] for frame in above]
     reach = [REACH * max(1e-9, *(np.abs(pair[axis]).max() for pair in lines)) for axis in (0, 1)]
-    rows, columns = level.shape
+    rows, columns = frames[0].shape
     return {
         "shown": [
             {
