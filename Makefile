@@ -2,6 +2,7 @@
 # make demo DATA=path    the same on dark frames of your own
 # make test              the tests that take a few minutes
 # make test-slow         all tests that need no accelerator, browser or stop-watch
+# make test-browser      reports in Chromium, which must be there: apt-get install chromium
 # make lint              ruff and mypy
 #
 # Needs Python 3.11 or later, git and make. Everything is installed into .venv, once.
@@ -12,7 +13,7 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13 python3.14 p
 BIN = $(VENV)/bin
 ARGS ?=
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow test-browser lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/hsnoise demo $(if $(DATA),--data "$(DATA)") $(ARGS)
@@ -22,6 +23,9 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not gpu and not browser and not benchmark" $(ARGS)
+
+test-browser: $(VENV)/.installed-browser
+	$(BIN)/python -m pytest -m browser -rs tests/test_report_browser.py $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
@@ -41,3 +45,7 @@ $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
 $(VENV)/.installed-dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-browser: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable ".[browser]"
+	@touch $@

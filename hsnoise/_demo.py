@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise import cameras
+from hsnoise import cameras, examples, report
 from hsnoise._loading import load_capture
 from hsnoise._output import frames_file, write_atomically, write_figure
 from hsnoise._progress import fit_with_progress
@@ -29,21 +29,30 @@ noise are off together: their ratios are known better than themselves."""
 
 def run(args: argparse.Namespace) -> None:
     check_folder(args.out)
+    limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
+    if args.real:
+        if args.data:
+            raise ValueError("--real: takes the frames that come with hsnoise, so it does not go with --data")
+        night = str(examples.st8(args.out / "night"))
+        print(f"The frames of an SBIG ST-8, an astronomical CCD camera, are in {night}. So is their licence: CC0.")
+        args.data = [night]
     if args.data:
-        _on_frames(args, load_capture(args.data, args), {"files": args.data})
+        _on_frames(args, load_capture(args.data, args), {"files": args.data}, limits)
         return
     stack, truth = simulated(args.out)
-    _improved(args, stack, {"simulated": "canon_5d3 with row noise", "seed": SEED}, truth)
+    _improved(args, stack, {"simulated": "canon_5d3 with row noise", "seed": SEED}, limits, truth)
 
 
-def _on_frames(args: argparse.Namespace, stack: FrameStack, source: dict[str, Any]) -> None:
+def _on_frames(
+    args: argparse.Namespace, stack: FrameStack, source: dict[str, Any], limits: dict[str, float | None]
+) -> None:
     """The loop on frames whose truth nobody knows; a fit alone where they do not determine the gain."""
     stack.check()
     args.out.mkdir(parents=True, exist_ok=True)
     print(stack)
     fit = fit_with_progress(stack, "auto")
     if fit.has_gain:
-        _improved(args, stack, source, max_minutes=MINUTES)
+        _improved(args, stack, source, {**limits, "max_minutes": limits["max_minutes"] or MINUTES})
         return
     written = write_results(fit, args.out, source)
     tell(page_of_fit(fit), [f"Written to {args.out}/: {', '.join(written)}"], args.verbose)
@@ -53,16 +62,19 @@ def _improved(
     args: argparse.Namespace,
     stack: FrameStack,
     source: dict[str, Any],
+    limits: dict[str, float | None],
     truth: NoiseModel | None = None,
-    max_minutes: float | None = None,
 ) -> None:
     print("Fitting them, finding what the model lacks, and fitting again: a few minutes ...", flush=True)
-    story = improve_with_progress(stack, SEED, args.out, source, max_minutes=max_minutes)
+    page = args.out / "report.html"
+    story = improve_with_progress(stack, SEED, args.out, source, page=page, **limits)
     foot = [f"Written to {args.out}/: {', '.join([*keep(story, args.out, source), 'story.png'])}"]
     write_figure(args.out / "story.png", story.plot())
+    report.write_report(page, story, stack, files=source.get("files", ()), seed=SEED)
     if truth is not None:
         foot = [*OFF_BY.splitlines(), *foot]
         foot.append(f"Hidden in these frames was {HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
+    foot.append(f"All of this is on one page, for a browser: {page}")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
     foot.append(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
     tell(page_of_story(story, truth), foot, args.verbose)

@@ -58,7 +58,9 @@ def _demo_arguments(commands: Any) -> None:
     demo.add_argument(
         "--data", nargs="+", metavar="PATH", help="take these dark frames instead: a folder, files or a pattern"
     )
+    demo.add_argument("--real", action="store_true", help="take the frames of a real CCD camera that come with hsnoise")
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
+    _limit_arguments(demo)
     _capture_arguments(demo)
 
 
@@ -138,14 +140,15 @@ def _loop_arguments(commands: Any) -> None:
         )
         parser.add_argument("--seed", type=count, default=0, help="of the model's samples (default 0)")
         if name == "improve":
-            parser.add_argument(
-                "--max-minutes",
-                type=minutes,
-                metavar="M",
-                help="end after so long, with what there is then; the first fit is finished in any case",
-            )
-            parser.add_argument("--max-steps", type=count, metavar="N", help="add no more effects than this")
+            _limit_arguments(parser)
         _capture_arguments(parser)
+
+
+def _limit_arguments(parser: argparse.ArgumentParser) -> None:
+    """When the loop ends."""
+    text = "end after so long, with what there is then; the first fit is finished in any case"
+    parser.add_argument("--max-minutes", type=minutes, metavar="M", help=text)
+    parser.add_argument("--max-steps", type=count, metavar="N", help="add no more effects than this")
 
 
 def _method_argument(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise import _interrupting, criticism
+from hsnoise import _interrupting, criticism, report
 from hsnoise._output import write_atomically, write_figure
 from hsnoise._progress import busy
 from hsnoise.criticism import Story
@@ -24,13 +24,23 @@ def check_folder(path: Path) -> None:
 
 
 def improve_with_progress(
-    stack: FrameStack, seed: int, out: Path, source: dict[str, Any], start: NoiseModel | None = None, **limits: Any
+    stack: FrameStack,
+    seed: int,
+    out: Path,
+    source: dict[str, Any],
+    start: NoiseModel | None = None,
+    page: Path | None = None,
+    **limits: Any,
 ) -> Story:
-    """The loop; each model that it keeps is written to `out`."""
+    """The loop; each model that it keeps is written to `out`, and the story so far to `page`, if there is to be one."""
+
+    def kept(story: Story) -> None:
+        keep(story, out, source)
+        if page is not None:
+            report.write_report(page, story, stack, files=source.get("files", ()), seed=seed)
+
     with busy("Fitting the first model", limits.get("max_minutes")) as say:
-        return criticism.improve(
-            stack, model=start, seed=seed, progress=say, keep=lambda story: keep(story, out, source), **limits
-        )
+        return criticism.improve(stack, model=start, seed=seed, progress=say, keep=kept, **limits)
 
 
 def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:

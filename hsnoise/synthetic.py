@@ -18,6 +18,7 @@ import numpy as np
 from hsnoise._threads import in_threads
 from hsnoise._types import unit_in_words
 from hsnoise.coordinates import Coordinates, coordinates_for, labels
+from hsnoise.covariances import as_scattered, not_surer_than
 from hsnoise.draws import FAR_OFF, black_level_of, draw_capture, floored_variance, part_of, share_of_far
 from hsnoise.knobs import Knob, knobs
 from hsnoise.maximise import gradient_at
@@ -40,10 +41,9 @@ STEP_SIGMA, STEP_LOG = 2.0, 0.2  # for derivatives: standard errors, and for eff
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
-SHRINKAGE, DRAWS_OF_ALL = 0.1, 10.0  # what all numbers say of the scatter of one counts as so many draws
+SHRINKAGE = 0.1  # of a correlation to its diagonal, at least
 MARGIN = 1.15
 UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
-MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ def _search(problem: Problem, tick) -> tuple[np.ndarray, np.ndarray, float, int]
     # The search knows means to a third of their scatter, and scatter from where it began.
     here = point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
-    scattered = _as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
+    scattered = as_scattered(covariance, gain, (here.drawn - here.drawn.mean(0)) / scale)
     return here.y + step * problem.share_of(step), scattered, length, iterations
 
 
@@ -309,7 +309,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         params=problem.in_float64(y),
         physics=problem.physics(y),
         names=(*base.names, *(knob.label for knob in problem.knobs)),
-        covariance=_not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
+        covariance=not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
         method="synthetic",
         outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
         iterations=iterations,
@@ -333,34 +333,6 @@ def _in_order(problem: Problem, covariance: np.ndarray) -> np.ndarray:
     whole[here] = whole[:, here] = 0.0
     whole[np.ix_(here, here)] = covariance[np.ix_(there, there)]
     return whole
-
-
-def _as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """`covariance` [number, number], widened if estimates from draws scatter more than weights without correlation say.
-
-    gain [number, statistic] leads from statistics to the score; z are draws about their mean [draw, statistic].
-    """
-    estimates, known = z @ (covariance @ gain).T, len(z) - 1
-    ratio = (estimates**2).sum(0) / known / np.diagonal(covariance)
-    # Few draws: what they say of one number is averaged with what they say of all.
-    of_all = DRAWS_OF_ALL / (known + DRAWS_OF_ALL)
-    factor = np.sqrt(np.maximum((1 - of_all) * ratio + of_all * ratio.mean(), 1.0))
-    return covariance * factor[:, None] * factor[None, :]
-
-
-def _not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """`covariance`, widened where it claims to know base parameters better than the likelihood did without the effects.
-
-    The effects' own errors are widened by as much.
-    """
-    n, known = len(base), np.isfinite(np.diagonal(base))
-    before = np.where(known, np.diagonal(base), 0.0)
-    growth = np.sqrt(np.maximum(before / np.maximum(np.diagonal(covariance)[:n], 1e-300), 1.0))
-    few = growth[known & (growth < MOST_GROWTH)]
-    factor = np.concatenate([growth, np.full(len(covariance) - n, np.median(few) if few.size else 1.0)])
-    widened = covariance * factor[:, None] * factor[None, :]
-    widened[np.flatnonzero(~known), np.flatnonzero(~known)] = np.inf  # still not determined
-    return widened
 
 
 def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[str]:

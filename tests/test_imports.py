@@ -17,10 +17,10 @@ ORDER = """_interrupting _conclusion _html _pandas _types _keys _threads _compil
     _poisson _coloured _frames _reading _describing _joining _arguments _output examples stack io _source
     effects _effect_json arrivals signal_chain stlstm weights video model mosaic cameras photometry
     _counting flat_pairs flats flat_gain narrow_noise statistics structure draws decomposition pixels rows
-    flat_likelihood physics moments plan likelihood coordinates maximise profile result flat_notes notes lut
-    line_spectrum line knobs synthetic pixel_fit pixel_result doubts fit plots _budget_table budget
-    criticism inspection report _parsing _sheet training _options _table _telling _progress _results
-    _enhance _loading _sample _demo cli __main__""".split()
+    flat_likelihood physics moments plan likelihood coordinates covariances maximise profile result
+    flat_notes notes lut line_spectrum line knobs synthetic pixel_fit pixel_result doubts fit plots
+    _budget_table budget criticism inspection report _parsing _sheet training _options _table _telling
+    _progress _results _enhance _loading _sample _demo cli __main__""".split()
 IO_MAY_SEE = {"io", "stack", "_types", "_arguments", "_frames", "_joining"}
 FILES = [path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"]
 

@@ -304,8 +304,8 @@ def _left_out(refused: dict[str, str], found: Diagnosis, comparison: Comparison)
     tried = "; ".join(f"{name} {reason}" for name, reason in refused.items())
     said = f"What was tried is left out: {tried}."
     if comparison.error <= CHANCE_ERROR:
-        return f"{said} Without it the error is {comparison.error:.2f}, as chance gives."
-    return f"{said} {_end(found, comparison)}"
+        return f"Nothing more could be added, and the error is {comparison.error:.2f}, as chance gives. {said}"
+    return f"{_end(found, comparison)} {said}"
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:

@@ -97,12 +97,14 @@ class Story:
     def _in_short(self) -> str:
         """What was added, what became of the error, why the story ended."""
         added = [step.added for step in self.steps if step.added]
+        head, _, _ = self.ended.partition(". ")  # the rest, what was tried in vain, is in `ended`
+        head = head.partition(": ")[0].removesuffix(".").replace(f" (error {self.errors[-1]:.2f})", "")
         if not added:
-            return self.ended
+            return f"{head} (error {number(self.errors[-1])})."
         first, last = self.errors[0], self.errors[-1]
         how = "fell" if last < first else "went"
-        ended = (self.ended[0].lower() + self.ended[1:]).replace(f" (error {last:.2f})", "")  # it is said already
-        return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}"
+        ended = head[0].lower() + head[1:]
+        return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}."
 
     @property
     def start(self) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, MultipleLocator, NullLocator
 
+from hsnoise.plots._groups import COLOUR_OF, INK, PLACE, WORDS, Part, parts_of
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
 from hsnoise.result import number
 
@@ -14,8 +16,8 @@ MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]
 ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
 MOST_TICKS = 3  # to either side of 0
-MOST_DECADES = 4  # named below the errors of a story
-SHORT_RANGE = 30.0  # of errors, that needs more than decades
+MOST_LINES = 30  # powers of ten, each with a line of its own
+LETTER = 0.009  # its width, of the longest bar of a story
 LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
@@ -80,31 +82,47 @@ def ranking(found) -> Figure:
 
 
 def story(found) -> Figure:
-    """The error of each step of the loop, and what was added.
+    """How far each group of statistics is off after each step of the loop, stacked, and the error.
 
     Args:
         found: result of `hsnoise.improve`.
     """
     names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
-    figure = new_figure(5.2, 0.5 * len(names) + 1.7, "Error of the model, step by step")
+    steps = [parts_of(step.comparison) for step in found.steps]
+    figure = new_figure(10.0, 0.42 * len(names) + 1.9, "How far the model is off, step by step")
     axes = figure.subplots()
-    y = np.arange(len(names))
-    axes.plot(found.errors, y, "o-", color=BAR, markersize=8)
-    for at, error in zip(y, found.errors, strict=True):
-        axes.annotate(number(error), (error, at), xytext=(9, -9), textcoords="offset points", fontsize=10)
-    axes.axvline(1.0, color=FIT, linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
-    low, high = min(0.5, 0.7 * min(found.errors)), max(2.0, *found.errors)
-    axes.set_xlim(low, high * (high / low) ** 0.22)  # room for the last number
-    within = (1.0, 2.0, 5.0) if high < SHORT_RANGE * low else (1.0,)
-    axes.xaxis.set_major_locator(LogLocator(subs=within, numticks=MOST_DECADES))
-    axes.xaxis.set_major_formatter(_plain)
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylim(len(names) - 0.5, -0.6)
-    axes.set_yticks(y, names)
-    axes.set_xlabel("error (dotted: 1, the model's own samples)")
+    longest = max(1.0, *(sum(part.decades for part in parts) for parts in steps))
+    for y, (parts, error) in enumerate(zip(steps, found.errors, strict=True)):
+        _stack(axes, y, parts, longest)
+        end = sum(part.decades for part in parts)
+        fits = "" if parts else ": no group is further off than the model's own samples"
+        axes.annotate(f"error {number(error)}{fits}", (end, y), (6, 0), textcoords="offset points", va="center")
+    axes.set_xlim(0, 1.16 * longest)  # room for the error
+    axes.set_ylim(len(names) - 0.45, -0.55)
+    axes.set_yticks(range(len(names)), names)
+    axes.xaxis.set_major_locator(MultipleLocator(1 if longest < MOST_LINES else 5))
+    axes.set_xlabel(
+        "length of a part: by how many powers of ten the misfit of this group of statistics\n"
+        "exceeds that of the model's own samples; the error is that of the worst group"
+    )
     tidy(axes)
+    axes.grid(False, axis="y")
+    there = {part.family for parts in steps for part in parts}
+    handles = [Patch(color=COLOUR_OF[name], label=WORDS[name]) for name in PLACE if name in there]
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9)
     return figure
+
+
+def _stack(axes: Axes, y: int, parts: list[Part], longest: float) -> None:
+    """One bar of parts side by side, named where there is room."""
+    left = 0.0
+    for part in parts:
+        colour, ink = COLOUR_OF[part.family], INK[part.family]
+        axes.barh(y, part.decades, 0.72, left=left, color=colour, edgecolor="white", linewidth=0.6)
+        if part.decades > LETTER * len(part.group) * longest:
+            axes.annotate(part.group, (left + part.decades / 2, y), ha="center", va="center", fontsize=8, color=ink)
+        left += part.decades
 
 
 def _wide_scale(axes: Axes) -> None:

@@ -1,4 +1,4 @@
-"""One page of HTML about a capture and a model: what `compare`, `diagnose` or `improve` found, with figures.
+"""One page of HTML about a capture and a model: what `fit`, `compare`, `diagnose` or `improve` found, with figures.
 
 The page holds its figures and styles, asks no network for anything, and is written whole or not at all.
 """
@@ -14,6 +14,8 @@ from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.model import NoiseModel
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
+
+Found = Comparison | Diagnosis | Story | FitResult
 
 __all__ = ["check_path", "page", "write_report"]
 
@@ -35,7 +37,7 @@ def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None
 
 
 def page(
-    found: Comparison | Diagnosis | Story,
+    found: Found,
     stack: FrameStack,
     *,
     fit: FitResult | NoiseModel | None = None,
@@ -46,10 +48,10 @@ def page(
     """The page as text.
 
     Args:
-        found: result of `hsnoise.compare`, `diagnose` or `improve`.
+        found: result of `hsnoise.compare`, `diagnose`, `improve` or `fit`.
         stack: the capture that it is about; its dark frames are shown beside draws of the model.
-        fit: the model that was compared or diagnosed, with standard errors if it is a FitResult; not for a Story,
-            which has its own.
+        fit: the model that was compared or diagnosed, with standard errors if it is a FitResult; not for a Story
+            or a fit, which have their own.
         comparison: of that model, for a Diagnosis: its bars and worst statistics are left out without.
         files: names of the files that the capture was read from.
         seed: of the draws that are shown.
@@ -60,14 +62,14 @@ def page(
     from hsnoise.report._context import context  # Jinja2 and matplotlib are slow to import
     from hsnoise.report._figures import render
 
-    if isinstance(found, Story):
-        fit = found.fit
+    if isinstance(found, Story | FitResult):
+        fit = found.fit if isinstance(found, Story) else found
     if not isinstance(fit, FitResult | NoiseModel):
         raise TypeError(f"fit: expected a FitResult or a NoiseModel, got {type(fit).__name__}")
     return render(context(found, stack, fit, comparison, files, seed), found, stack, fit, seed)
 
 
-def write_report(path: str | os.PathLike, found: Comparison | Diagnosis | Story, stack: FrameStack, **keywords) -> None:
+def write_report(path: str | os.PathLike, found: Found, stack: FrameStack, **keywords) -> None:
     """Write the page of `page(found, stack, **keywords)` to a file.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
@@ -13,8 +14,10 @@ from hsnoise._conclusion import Conclusion, Light
 from hsnoise._types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.compare import FITS, nearer
+from hsnoise.criticism.improve import UNFINISHED
 from hsnoise.criticism.story import together
 from hsnoise.model import NoiseModel
+from hsnoise.plots._groups import COLOUR_OF, INK, PLACE, WORDS, Part, family_of, parts_of
 from hsnoise.result import FitResult, number, rounded
 from hsnoise.stack import FrameStack
 from hsnoise.structure import explained
@@ -23,11 +26,18 @@ ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars
 YARDSTICK = "1.0 would be as close as the model's own samples"
 MOST_CANDIDATES, MOST_FILES = 10, 3
-TITLES = {Comparison: "Model against measurement", Diagnosis: "What is missing", Story: "How the model was improved"}
+TITLES = {
+    Comparison: "Model against measurement",
+    Diagnosis: "What is missing",
+    Story: "How the model was improved",
+    FitResult: "A model fitted to these frames",
+}
+LIGHTS = {Light.GREEN: "Fits", Light.AMBER: "With doubts", Light.RED: "Do not use this"}
+LETTER = 0.95  # width in percent of a desktop's bar, of a name within a part of it
 
 
 def context(
-    found: Comparison | Diagnosis | Story,
+    found: Comparison | Diagnosis | Story | FitResult,
     stack: FrameStack,
     fit: FitResult | NoiseModel,
     comparison: Comparison | None,
@@ -41,12 +51,16 @@ def context(
         comparison = found
     elif story is not None:
         comparison, diagnosis = story.steps[-1].comparison, story.steps[-1].diagnosis
+    said = conclusion(found, comparison)
     return {
         "title": TITLES[type(found)],
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
-        "conclusion": conclusion(found, comparison),
+        "conclusion": said,
+        "light": LIGHTS[said.light],
+        "said": _apart(said.sentence),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
+        "doubts": fit.doubts if isinstance(fit, FitResult) else (),
         "notes": fit.notes if isinstance(fit, FitResult) else (),
         "outcome": fit.outcome if isinstance(fit, FitResult) else "",
         "bars": None if comparison is None else bars(comparison),
@@ -55,12 +69,14 @@ def context(
         "diagnosis": diagnosis,
         "ranking": [] if diagnosis is None else ranking(diagnosis),
         "story": None if story is None else steps(story),
+        "stacked": None if story is None else stacked(story),
+        "unfinished": story is not None and story.ended.startswith(UNFINISHED.partition(":")[0]),
         "ended": "" if story is None else story.ended,
         "split": "" if story is None else story.split,
     }
 
 
-def conclusion(found: Comparison | Diagnosis | Story, comparison: Comparison | None) -> Conclusion:
+def conclusion(found: Comparison | Diagnosis | Story | FitResult, comparison: Comparison | None) -> Conclusion:
     """The finding in one sentence, with the error of the model that a diagnosis is about."""
     said = found.conclusion
     if not isinstance(found, Diagnosis) or comparison is None:
@@ -71,6 +87,15 @@ def conclusion(found: Comparison | Diagnosis | Story, comparison: Comparison | N
         return Conclusion(Light.RED, text)
     after = f" ({error})" if found.verdict == "nothing missing" else f"; {error}, {YARDSTICK}"
     return Conclusion(said.light, f"{said.sentence.removesuffix('.')}{after}.")
+
+
+def _apart(sentence: str) -> tuple[str, str]:
+    """A conclusion as what is read first, up to its first full stop or semicolon, and the rest."""
+    found = re.match(r"(.+?[.;]) (.+)", sentence)
+    if found is None:
+        return sentence, ""
+    first, rest = found.groups()
+    return first.replace(";", "."), rest[0].upper() + rest[1:]
 
 
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
@@ -104,6 +129,34 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     return [*rows, *({**row, "error": "held"} for row in chosen)]
 
 
+def stacked(story: Story) -> dict[str, Any]:
+    """A bar for each step of a story, its parts the groups of statistics; positions in percent of the width."""
+    bars = [parts_of(step.comparison) for step in story.steps]
+    longest = max(1.0, *(sum(part.decades for part in parts) for parts in bars))
+    names = [story.start, *(f"+ {step.added}" for step in story.steps[1:])]
+    there = {part.family for parts in bars for part in parts}
+    return {
+        "decade": f"{100 / longest:.4f}%",
+        "steps": [
+            {"name": name, "error": number(error), "parts": [_part(part, longest) for part in parts]}
+            for name, error, parts in zip(names, story.errors, bars, strict=True)
+        ],
+        "legend": [(COLOUR_OF[family], WORDS[family]) for family in PLACE if family in there],
+    }
+
+
+def _part(part: Part, longest: float) -> dict[str, Any]:
+    width = 100 * part.decades / longest
+    return {
+        "group": part.group,
+        "times": number(part.times),
+        "width": f"{width:.3f}%",
+        "colour": COLOUR_OF[part.family],
+        "ink": INK[part.family],
+        "named": width > LETTER * len(part.group) + 1,
+    }
+
+
 def bars(comparison: Comparison) -> dict[str, Any]:
     """Misfit of each group as a bar on a logarithmic scale, worst first; positions in percent of the width.
 
@@ -111,29 +164,40 @@ def bars(comparison: Comparison) -> dict[str, Any]:
     """
     groups = sorted(comparison.groups.items(), key=lambda item: -item[1])
     own = comparison.own_misfit
-    span = np.log(1.1 * max(groups[0][1], own, 10.0) / LEAST_SHOWN)
-
-    def at(misfit: float) -> str:
-        return f"{100 * max(np.log(max(misfit, LEAST_SHOWN) / LEAST_SHOWN) / span, 0.005):.2f}%"
-
+    largest = 1.1 * max(groups[0][1], own, 10.0)
     shown = [
-        {"name": g, "misfit": f"{m:.2f}" if m < 10 else number(m), "width": at(m), "alarm": m > ALARM * own}
+        {
+            "name": g,
+            "misfit": f"{m:.2f}" if m < 10 else number(m),
+            "width": _along(m, LEAST_SHOWN, largest),
+            "colour": COLOUR_OF[family_of(g)],
+            "alarm": m > ALARM * own,
+        }
         for g, m in groups
     ]
-    return {"groups": shown, "one": at(1.0), "own": at(own), "own_misfit": number(own)}
+    ends = LEAST_SHOWN, largest
+    return {"groups": shown, "one": _along(1.0, *ends), "own": _along(own, *ends), "own_misfit": number(own)}
+
+
+def _along(value: float, low: float, high: float) -> str:
+    """The place of a value on a logarithmic scale, in percent of the width."""
+    return f"{100 * max(np.log(max(value, low) / low) / np.log(high / low), 0.005):.2f}%"
 
 
 def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Rows of the ranking table."""
+    """Rows of the ranking table; `width` of the bar of a score, in percent of the width."""
+    shown = diagnosis.ranking[:MOST_CANDIDATES]
+    largest = max(10.0, *(c.score for c in shown))  # what chance gives makes no long bar
     return [
         {
             "name": c.name,
             "score": f"{c.score:z.1f}",
+            "width": f"{100 * max(c.score / largest, 0.005):.2f}%",
             "p": c.chance,
             "misfit": f"{c.misfit:z.1f}",
             "named": c.name in diagnosis.names,
         }
-        for c in diagnosis.ranking[:MOST_CANDIDATES]
+        for c in shown
     ]
 
 

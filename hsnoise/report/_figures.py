@@ -1,8 +1,7 @@
-"""Figures of the page, inline: SVG that takes the colours of the page, PNG for frames; and the page around them."""
+"""Figures of the page, inline: SVG that takes the colours of the page; and the page around them."""
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 from typing import Any
@@ -15,22 +14,26 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
-from PIL import Image
 
-from hsnoise import plots
 from hsnoise._types import seconds
+from hsnoise.budget import BudgetRow
 from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.model import NoiseModel
-from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy
+from hsnoise.plots._budget import CLEAR, LABELS, ORDER, SHADES
+from hsnoise.plots._style import NAMES, new_figure, plain_log, tidy
 from hsnoise.report import _measured
-from hsnoise.report._measured import Shown
+from hsnoise.report._measured import Middle, Shown
+from hsnoise.report._pictures import pictures
 from hsnoise.result import FitResult
 from hsnoise.stack import FrameStack
 from hsnoise.structure import SHORT
 
 SIZE_IN = (4.4, 3.1)  # of a panel: its letters can be read at the width of a phone
-STRETCH = (0.5, 99.5)  # percentiles of the measured frame that are black and white
 LINES = ("row", "column")
+# Of all figures: measured is black and becomes the page's text colour, the others are colours that the page sets.
+MEASURED, MODEL, BEFORE, BAND = "#000000", "#6a3d9a", "#777777", "#b9a5d3"
+PAGE_COLOURS = {MEASURED: "currentColor", MODEL: "var(--model)", BEFORE: "var(--before)", BAND: "var(--band)"}
+GRID = "#e6e6e6"  # as in the plots' style
 
 
 def breakable(name: str) -> Markup:
@@ -40,7 +43,7 @@ def breakable(name: str) -> Markup:
 
 def render(
     context: dict[str, Any],
-    found: Comparison | Diagnosis | Story,
+    found: Comparison | Diagnosis | Story | FitResult,
     stack: FrameStack,
     fit: FitResult | NoiseModel,
     seed: int,
@@ -49,11 +52,11 @@ def render(
     comparison = context["comparison"]
     # Where the model fails: what is missing from short exposures may drown in the dark current of long ones.
     shortest = comparison is not None and any(SHORT in sentence for sentence in comparison.worst[:1])
-    at = _measured.shown(stack, fit.params if isinstance(fit, FitResult) else fit, seed, shortest=shortest)
-    figures = {f"{NAMES[c]}, counts": histogram(at, c) for c in at.channels}
-    figures |= {f"{NAMES[c]}, {LINES[axis]} spectrum": spectrum(at, c, axis) for axis in (0, 1) for c in at.channels}
-    if len(at.measured) > 1:
-        figures |= {f"{NAMES[c]}, frame means": frame_means(at, c) for c in at.channels}
+    model = fit.params if isinstance(fit, FitResult) else fit
+    models = {"first model": found.steps[0].fit.params} if isinstance(found, Story) and len(found.steps) > 1 else {}
+    models["last model" if models else "model"] = model
+    at = _measured.shown(stack, model, seed, shortest=shortest)
+    near = _measured.middle(stack, list(models.values()), seed, shortest=shortest)
     environment = Environment(
         loader=PackageLoader("hsnoise.report"),
         autoescape=True,
@@ -67,28 +70,70 @@ def render(
         exposure=seconds(at.exposure_s),
         n_frames=len(at.measured),
         n_draws=len(at.drawn),
-        frames=frames(at),
-        figures={name: svg(figure, f"f{i}", name) for i, (name, figure) in enumerate(figures.items())},
-        story_figure=svg(plots.story(found), "story", "error of each step") if isinstance(found, Story) else "",
+        models=list(models),
+        pictures=pictures(near.frames, at.cfa, stack.shape),
+        budget=inline(budget_panels(near, list(models)), "b"),
+        figures=inline(panels(at), "f"),
     )
 
 
-def frames(at: Shown) -> dict[str, Any]:
-    """The middle of a measured and of a drawn frame as grey pictures at one stretch, and its limits in DN."""
-    pair = [_measured.crop(one[0]) for one in (at.measured, at.drawn[0])]
-    low, high = np.percentile(pair[0], STRETCH)
-    high = max(high, low + 1)
-    rows, columns = pair[0].shape
-    part = f"{'All' if pair[0].shape == at.measured.shape[1:] else 'The middle'} {rows} x {columns} pixels"
-    measured, drawn = (_png(np.clip((one - low) / (high - low), 0, 1)) for one in pair)
-    return {"measured": measured, "drawn": drawn, "low": f"{low:.4g}", "high": f"{high:.4g}", "part": part}
+def inline(figures: dict[str, Figure], prefix: str) -> list[Markup]:
+    """Figures by their names as elements of the page."""
+    return [svg(figure, f"{prefix}{i}", name) for i, (name, figure) in enumerate(figures.items())]
 
 
-def _png(grey: np.ndarray) -> str:
-    """A picture [row, column] of 0 (black) to 1 as the address of an inline image."""
-    buffer = io.BytesIO()
-    Image.fromarray(np.round(255 * grey).astype(np.uint8)).save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+def panels(at: Shown) -> dict[str, Figure]:
+    """Counts, spectra of rows and columns, and frame means of each colour."""
+    made = {f"{NAMES[c]}, counts": histogram(at, c) for c in at.channels}
+    made |= {f"{NAMES[c]}, {LINES[axis]} spectrum": spectrum(at, c, axis) for axis in (0, 1) for c in at.channels}
+    if len(at.measured) > 1:
+        made |= {f"{NAMES[c]}, frame means": frame_means(at, c) for c in at.channels}
+    return made
+
+
+def budget_panels(near: Middle, models: list[str]) -> dict[str, Figure]:
+    """The noise budget of each exposure and colour, measured and of the models; none where all are of one frame."""
+    budgets = near.budgets
+    if not budgets:
+        return {}
+    rows = [of for of in zip(*(one.rows for one in budgets), strict=True) if of[0].n_frames > 1]
+    sigmas = [np.sqrt(max(c.variance_dn2, 0)) for of in rows for row in of for c in row.components.values()]
+    sigmas = [sigma for sigma in sigmas if sigma > 0] or [1.0]  # frames without any noise
+    limits = max(0.5 * min(sigmas), 1e-4 * max(sigmas)), 2 * max(sigmas)
+    return {f"{_kind_of(of[0])}, noise budget": budget_panel(of, models, limits) for of in rows}
+
+
+def _kind_of(row: BudgetRow) -> str:
+    lit = "flat" if row.kind == "flat" else "dark"
+    return f"{NAMES[row.channel]}, {lit} of {seconds(row.exposure_s)}"
+
+
+def budget_panel(rows: tuple[BudgetRow, ...], models: list[str], limits: tuple[float, float]) -> Figure:
+    """Components of the noise of an exposure and colour: measured (dots), and of models (hollow); arrows: limits."""
+    figure, axes = _panel(_kind_of(rows[0]), "standard deviation / DN", "")
+    looks = {"measured": ("o", MEASURED, MEASURED, 30), "first model": ("D", "none", BEFORE, 34)}
+    for name, row in zip(("measured", *models), rows, strict=True):
+        marker, face, edge, size = looks.get(name, ("s", "none", MODEL, 62))
+        parts = [row.components[component] for component in ORDER]
+        value = np.array([part.variance_dn2 for part in parts])
+        error = np.array([part.standard_error_dn2 for part in parts])
+        clear, y = value > CLEAR * error, np.arange(len(ORDER))
+        style = {"s": size, "c": face, "edgecolors": edge, "linewidths": 1.4}
+        axes.scatter(np.sqrt(value[clear]), y[clear], marker=marker, label=name, zorder=3, **style)
+        most = np.sqrt(np.maximum(value, 0) + CLEAR * error)
+        axes.scatter(most[~clear], y[~clear], marker="<", zorder=2, **style)
+    swatches = axes.get_yaxis_transform()
+    axes.scatter(
+        [-0.03] * len(ORDER), y, s=46, marker="s", c=[SHADES[c] for c in ORDER], transform=swatches, clip_on=False
+    )
+    axes.set_yticks(y, [LABELS[name] for name in ORDER])
+    axes.tick_params(axis="y", length=0, pad=14)
+    axes.set_ylim(len(ORDER) - 0.5, -0.5)
+    axes.set_xscale("log")
+    axes.set_xlim(*limits)
+    plain_log(axes.xaxis)
+    figure.legend(fontsize=9, loc="outside lower center", ncols=len(rows), frameon=False)
+    return figure
 
 
 def histogram(at: Shown, channel: str) -> Figure:
@@ -97,9 +142,9 @@ def histogram(at: Shown, channel: str) -> Figure:
     measured = _measured.share(at.measured, at.cfa, channel, edges)
     drawn = np.mean([_measured.share(one, at.cfa, channel, edges) for one in at.drawn], axis=0)
     figure, axes = _panel(NAMES[channel], "count / DN", "share of pixels per DN")
-    axes.stairs(measured, edges, color=COLOURS[channel], fill=True, alpha=0.35)
-    axes.stairs(measured, edges, color=COLOURS[channel], linewidth=1.0, label="measured")
-    axes.stairs(drawn, edges, baseline=None, color=FIT, linewidth=1.4, label="model")
+    axes.stairs(measured, edges, color=MEASURED, fill=True, alpha=0.25)
+    axes.stairs(measured, edges, color=MEASURED, linewidth=0.8, label="measured")
+    axes.stairs(drawn, edges, baseline=None, color=MODEL, linewidth=1.6, label="model")
     axes.set_yscale("log")
     least = 0.5 / max(at.measured[..., ::2, ::2].size, 1) / np.diff(edges).max()
     axes.set_ylim(least, 3 * max(measured.max(), drawn.max()))
@@ -115,9 +160,9 @@ def spectrum(at: Shown, channel: str, axis: int) -> Figure:
     figure, axes = _panel(
         f"{NAMES[channel]}, {name}s", f"{name} frequency / cycles per frame", f"power of {name} means / DN²"
     )
-    axes.fill_between(k, drawn.min(0), drawn.max(0), color="0.6", alpha=0.4, linewidth=0)
-    axes.loglog(k, drawn.mean(0), color=FIT, linewidth=1.4, label="model")
-    axes.loglog(k, power, "o", color=COLOURS[channel], markersize=4.5, label="measured")
+    axes.fill_between(k, drawn.min(0), drawn.max(0), color=BAND, alpha=0.5, linewidth=0)
+    axes.loglog(k, drawn.mean(0), color=MODEL, linewidth=1.6, label="model")
+    axes.loglog(k, power, "o", color=MEASURED, markersize=4.5, label="measured")
     for along, values in ((axes.xaxis, k), (axes.yaxis, [*power, *drawn.ravel()])):
         _few_decades(along, min(values), max(values))
     return _legend(figure, axes)
@@ -129,9 +174,9 @@ def frame_means(at: Shown, channel: str) -> Figure:
     figure, axes = _panel(f"{NAMES[channel]}, frames", "frame number", "frame mean - mean of all / DN")
     number = np.arange(len(means[0]))
     for drawn in means[1:]:
-        axes.plot(number, drawn, color=FIT, linewidth=0.9, alpha=0.6)
-    axes.plot([], [], color=FIT, linewidth=0.9, label="model")
-    axes.plot(number, means[0], "o", color=COLOURS[channel], markersize=4.5, label="measured")
+        axes.plot(number, drawn, color=MODEL, linewidth=0.9, alpha=0.6)
+    axes.plot([], [], color=MODEL, linewidth=0.9, label="model")
+    axes.plot(number, means[0], "o", color=MEASURED, markersize=4.5, label="measured")
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     return _legend(figure, axes)
 
@@ -168,6 +213,6 @@ def svg(figure: Figure, prefix: str, label: str) -> Markup:
     box = re.search(r'viewBox="([^"]*)"', head).group(1)
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", body, flags=re.DOTALL)
     body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", body)
-    # Black, and the grid's and mono's grey of the plots' style.
-    body = body.replace("#000000", "currentColor").replace("#e6e6e6", "var(--grid)").replace("#404040", "var(--mono)")
+    for colour, of_page in {**PAGE_COLOURS, GRID: "var(--grid)"}.items():
+        body = body.replace(colour, of_page)
     return Markup('<svg viewBox="{}" role="img" aria-label="{}">').format(box, label) + Markup(body)

@@ -1,14 +1,17 @@
-"""A capture beside draws of the model, as numbers: frames, spectra of lines, histograms."""
+"""A capture beside draws of the models, as numbers: frames, spectra of lines, histograms, noise budgets."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from hsnoise._frames import channel_pixels, channel_planes
 from hsnoise._threads import in_threads
-from hsnoise.draws import check_fits, darks_of, draw_capture
+from hsnoise.budget import NoiseBudget, budget
+from hsnoise.draws import check_fits, darks_of, draw_capture, middle_of
 from hsnoise.model import NoiseModel
 from hsnoise.stack import FrameStack
 
@@ -16,7 +19,7 @@ DRAWS = 4
 SEED_APART = 9000  # the draws shown are none of those that the comparison was made with
 MOST_FRAMES = 16  # of the exposure shown
 BANDS_PER_OCTAVE = 4
-CROP = (480, 640)
+CROP = (240, 320)
 CORE, REACH = (2.0, 98.0), 3.0  # bins reach so many widths of the core to either side of it
 MOST_BINS = 90
 
@@ -32,6 +35,26 @@ class Shown:
     drawn: list[np.ndarray]
 
 
+@dataclass(frozen=True)
+class Middle:
+    """The middle of a few exposures, the dark one shown first, as measured and as each of some models draws it."""
+
+    measured: FrameStack
+    drawn: tuple[FrameStack, ...]
+
+    @property
+    def frames(self) -> list[np.ndarray]:
+        """The first dark frame [row, column], at most `CROP`: measured, and of each model."""
+        return [crop(stack.frame(0, 0)) for stack in (self.measured, *self.drawn)]
+
+    @property
+    def budgets(self) -> list[NoiseBudget]:
+        """Measured, and of each model; none where no exposure has two frames."""
+        if max(self.measured.n_frames) < 2:
+            return []
+        return in_threads(budget, [self.measured, *self.drawn])
+
+
 def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = False) -> Shown:
     """The longest (shortest) dark exposure of `stack`, and as many draws of it as scatter needs.
 
@@ -39,16 +62,41 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = F
         TypeError, ValueError: model and stack do not fit together, no darks.
     """
     check_fits(model, stack)
-    darks = darks_of(stack).select(frames=slice(0, MOST_FRAMES))
-    one_exposure = int(np.argmin(darks.exposure_s) if shortest else np.argmax(darks.exposure_s))
+    darks = _darks(stack)
+    first = int(np.argmin(darks.exposure_s) if shortest else np.argmax(darks.exposure_s))
+    # A stack of a single frame would be refused.
+    chosen = [first] if darks.n_frames[first] > 1 else [first, *(i for i in range(darks.n_exposures) if i != first)]
+    part = darks.select(exposures=chosen)
     seeds = [seed + SEED_APART + i for i in range(DRAWS)]
-    # All exposures are drawn, because a stack of a single frame would be refused.
-    drawn = in_threads(lambda one: _frames(draw_capture(one, model, darks), one_exposure), seeds)
-    exposure_s = float(darks.exposure_s[one_exposure])
-    return Shown(exposure_s, darks.cfa, darks.channels, _frames(darks, one_exposure), drawn)
+    drawn = in_threads(lambda number: _frames(draw_capture(number, model, part)), seeds)
+    return Shown(float(part.exposure_s[0]), part.cfa, part.channels, _frames(part), drawn)
 
 
-def _frames(stack: FrameStack, exposure: int) -> np.ndarray:
+def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shortest: bool = False) -> Middle:
+    """The dark exposure that is shown, the brightest flat, and of a sensor without colours the other extreme, too."""
+    measured = _middle(stack, shortest)
+    return Middle(measured, tuple(in_threads(lambda model: draw_capture(seed + SEED_APART, model, measured), models)))
+
+
+@lru_cache(maxsize=1)  # a page is written after each step of a story, and files are slow to read
+def _darks(stack: FrameStack) -> FrameStack:
+    return darks_of(stack).select(frames=slice(0, MOST_FRAMES))
+
+
+@lru_cache(maxsize=2)
+def _middle(stack: FrameStack, shortest: bool) -> FrameStack:
+    """The part of `stack` that `middle` shows, in memory."""
+    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
+    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
+    by_length = sorted(darks, key=lambda i: float(stack.exposure_s[i]), reverse=not shortest)
+    chosen = [by_length[0], *sorted(flats, key=lambda i: -float(stack.frame(i, 0).mean()))[:1]]
+    if by_length[-1] not in chosen and (stack.cfa == "mono" or stack.n_frames[chosen[0]] == 1):
+        chosen.append(by_length[-1])
+    part = middle_of(stack.select(exposures=chosen))
+    return part.with_counts([_frames(part, i) for i in range(part.n_exposures)], part.window)
+
+
+def _frames(stack: FrameStack, exposure: int = 0) -> np.ndarray:
     return np.stack(list(stack.frames(exposure)))
 
 

@@ -1,0 +1,65 @@
+"""Groups of statistics in the colours of the noise budget, and how far off they are as parts of a bar."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise.plots._budget import ORDER, SHADES
+
+OTHER = "other"
+COLOUR_OF = {**SHADES, OTHER: "#8C8C8C"}
+INK = dict.fromkeys(COLOUR_OF, "#000000") | {"temporal": "#ffffff"}  # readable on the colour
+WORDS = {
+    "temporal": "noise of pixels",
+    "row_x_frame": "rows, frame by frame",
+    "column_x_frame": "columns, frame by frame",
+    "frame": "levels, whole frames",
+    "pixel": "fixed pixels",
+    "column": "fixed columns",
+    "row": "fixed rows",
+    OTHER: "other",
+}
+FAMILIES = {
+    "noise": "temporal",
+    "tails": "temporal",
+    "spatial lags": "temporal",
+    "pixels over time": "temporal",
+    "row x frame": "row_x_frame",
+    "row spectrum": "row_x_frame",
+    "column x frame": "column_x_frame",
+    "frames over time": "frame",
+    "level": "frame",
+    "static pixels": "pixel",
+    "blocks": "pixel",
+    "static columns": "column",
+    "static rows": "row",
+}
+PLACE = {name: i for i, name in enumerate((*ORDER, OTHER))}
+
+
+class Part(NamedTuple):
+    """One group of statistics: its misfit over that of the model's own samples, and that in powers of ten, from 0."""
+
+    group: str
+    family: str
+    times: float
+    decades: float
+
+
+def family_of(group: str) -> str:
+    """The component of the noise budget that a group of statistics is about, or "other"."""
+    return FAMILIES.get(group.removeprefix("flats, "), OTHER)
+
+
+def parts_of(comparison) -> list[Part]:
+    """The groups that are further off than the model's own samples, by colour and then the worst first.
+
+    Misfits span many decades, and what is off by a thousand would hide what is off by ten: so each part is as long as
+    its misfit is in powers of ten.
+    """
+    own = comparison.own_misfit
+    times = {group: misfit / own for group, misfit in comparison.groups.items()}
+    parts = [Part(g, family_of(g), x, float(np.log10(x))) for g, x in times.items() if x > 1]
+    return sorted(parts, key=lambda part: (PLACE[part.family], -part.times))
