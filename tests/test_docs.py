@@ -28,7 +28,7 @@ def test_page_on_effects_of_ones_own_runs(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "page", page)
     exec(compile(code, "add-an-effect.md", "exec"), page.__dict__)
     said = capsys.readouterr().out
-    assert "missing: diagonal_streaks" in said and "synthetic likelihood" in said
+    assert "Missing: diagonal_streaks" in said and "synthetic likelihood" in said
     value, error, _ = page.again.table["diagonal_streaks.sigma"]
     assert abs(value - 1.2) < 4 * error
 
