@@ -10,8 +10,10 @@ import types
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import zarr
 from skimage.data import astronaut, coffee
 from skimage.io import imsave
 
@@ -60,6 +62,11 @@ def folder(tmp_path, monkeypatch) -> Path:
         of.mkdir(exist_ok=True)
         for path in (night / name).iterdir():
             (of / f"{name}_{path.name}").write_bytes(path.read_bytes())
+    # Arrays on a disk: darks of a colour camera, in chunks.
+    camera = hsnoise.cameras.canon_5d3(black_level_dn=512)
+    exposures_s = (0.1, 1.0, 10.0)
+    drawn = [hsnoise.sample_dark(i, 4, (64, 96), camera, exposure_s=t) for i, t in enumerate(exposures_s)]
+    zarr.save(str(tmp_path / "darks.zarr"), np.stack(drawn))
     imsave(tmp_path / "scene.png", astronaut()[:192, :256], check_contrast=False)
     (tmp_path / "clips").mkdir()
     for i in range(4):
@@ -145,3 +152,31 @@ def _enhancer(page) -> None:
 
 
 CHECKS = {"add-an-effect": _own_effect, "sampling": _sampling, "enhancer": _enhancer}
+
+
+def test_pytorch_takes_the_draws_without_a_copy():
+    torch = pytest.importorskip("torch")
+    (block,) = [code for _, code in blocks(ROOT / "docs" / "sampling.md") if "import torch as xp" in code]
+    block = block.replace("import numpy as xp", "import torch as xp")
+    page = {"jax": jax, "jnp": jnp, "hsnoise": hsnoise, "camera": hsnoise.cameras.grasshopper3()}
+    exec(compile(block, "sampling.md", "exec"), page)
+    light = torch.full((2, 32, 64), 3.0)
+    drawn = page["noisy"](1, light)
+    assert drawn.shape == light.shape and drawn.dtype == torch.float32
+    expected = hsnoise.sample(jax.random.key(1), np.full((2, 32, 64), 3.0, np.float32), page["camera"])
+    np.testing.assert_array_equal(drawn.numpy(), np.asarray(expected, np.float32))
+    # The same memory on both sides.
+    array = jax.dlpack.from_dlpack(light)
+    assert array.unsafe_buffer_pointer() == light.data_ptr()
+    assert torch.from_dlpack(array).data_ptr() == array.unsafe_buffer_pointer()
+    # In a training loop: the loss of a network on fresh noise falls.
+    torch.manual_seed(0)
+    network, losses = torch.nn.Conv2d(1, 1, 5, padding=2), []
+    optimiser = torch.optim.Adam(network.parameters(), 1e-2)
+    for step in range(30):
+        loss = ((network(page["noisy"](step, light)[:, None])[:, 0] - light) ** 2).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.2 * losses[0]

@@ -280,7 +280,7 @@ def test_a_page_of_a_fit_says_its_doubts(stack, story):
 def test_a_page_of_an_unfinished_story_says_so(stack, story):
     so_far = replace(story, steps=story.steps[:1], ended=UNFINISHED)
     text = Elements(report.page(so_far, stack)).text
-    assert "Do not use this Not finished: whether something is missing" in text
+    assert "Do not use this Not finished (error 88.1)" in text
     assert "This page was written while the search went on." in text
     assert "This page was written while" not in Elements(report.page(story, stack)).text
 

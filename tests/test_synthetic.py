@@ -8,14 +8,13 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise.covariances import as_scattered, not_surer_than
 from hsnoise.effects import RowNoise
 from hsnoise.synthetic import (
     LAST_DRAWS,
     MOST_ITERATIONS,
     SHORT_STEP,
     Problem,
-    _as_scattered,
-    _not_surer_than,
     _search,
     fit_synthetic,
     knobs,
@@ -37,7 +36,7 @@ def draws(covariance, seed):
 
 def test_errors_of_right_weights_stay():
     covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean([_as_scattered(covariance, gain, draws(np.eye(STATISTICS), s)) for s in range(40)], 0)
+    widened = np.mean([as_scattered(covariance, gain, draws(np.eye(STATISTICS), s)) for s in range(40)], 0)
     assert np.sqrt(np.diagonal(widened) / np.diagonal(covariance)) == pytest.approx(1.0, abs=0.15)
 
 
@@ -45,7 +44,7 @@ def test_errors_of_weights_that_hide_a_correlation_are_widened():
     together = SLOPES[:, 0] / np.linalg.norm(SLOPES[:, 0])
     true = np.eye(STATISTICS) + 8.0 * np.outer(together, together)  # the first number's own direction scatters thrice
     covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean([_as_scattered(covariance, gain, draws(true, s)) for s in range(40)], 0)
+    widened = np.mean([as_scattered(covariance, gain, draws(true, s)) for s in range(40)], 0)
     ratio = np.sqrt(np.diagonal(widened) / np.diagonal(covariance))
     assert 2.4 < ratio[0] < 3.2 and np.all(ratio >= 1.0)
 
@@ -146,6 +145,6 @@ def test_a_step_that_leads_away_is_taken_back():
 
 
 def test_what_a_line_fit_does_not_know_stays_unknown():
-    covariance = _not_surer_than(np.diag([4.0, np.inf]), np.eye(3))
+    covariance = not_surer_than(np.diag([4.0, np.inf]), np.eye(3))
     np.testing.assert_allclose(np.diagonal(covariance), [4.0, np.inf, 4.0])
     assert not np.isnan(covariance).any()

@@ -104,7 +104,7 @@ def test_hidden_effect_is_named(effect, name, few_candidates):
 def test_clean_capture_misses_nothing(few_candidates):
     found = hsnoise.diagnose(MODEL, capture(), draws=40)
     assert found.verdict == "nothing missing" and found.best is None and found.names == ()
-    assert "nothing missing" in str(found)
+    assert "Nothing significant is missing" in str(found)
 
 
 @pytest.mark.slow
