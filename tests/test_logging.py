@@ -80,8 +80,9 @@ def test_an_improvement_tells_what_is_tried_and_the_error_so_far(few_candidates,
     with caplog.at_level(logging.INFO, logger="hsnoise"):
         story = hsnoise.improve(stack, model=MODEL, max_steps=0, progress=heard.append)
     told = [message for name, message in said(caplog, logging.INFO) if name == "hsnoise.criticism.improve"]
-    assert heard[0] == "Fitting the first model" and "Comparing with the model's own samples" in heard
-    assert [sentence for sentence in told if sentence in heard] == [s for s in heard if not s[-1].isdigit()]
+    stages = [sentence for sentence in heard if not sentence[-1].isdigit()]  # captures that are drawn are numbered
+    assert heard[0] == stages[0] == told[0] == "Fitting the first model" and len(heard) > len(stages)
+    assert [sentence for sentence in told if sentence in heard] == stages
     assert any(message.startswith("Error ") and message.endswith(" with the first model") for message in told)
     assert told[-1] == f"Improved: {story.conclusion}" and capfd.readouterr() == ("", "")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -317,7 +318,8 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     effects = {"row_noise": fx.RowNoise(1.0), "frame_offset": fx.FrameOffset(1.0), "column_noise": fx.ColumnNoise(1.0)}
     effects["hot_pixels"] = fx.HotPixels(0.01, 9.0)
     candidates, told = [SimpleNamespace(name=name, effect=effect) for name, effect in effects.items()], []
-    step, tried = SimpleNamespace(), []
+    step, tried = Step(SimpleNamespace(doubts=("of the fit before",)), None, None, "column_noise", 0.0, ()), []
+    checked = replace(step, fit=SimpleNamespace(doubts=()))
     why = {"frame_offset": "changed nothing by itself", "column_noise": ""}
 
     def with_one_more(self, steps, candidate):
@@ -326,9 +328,10 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
 
     monkeypatch.setattr(_Work, "with_one_more", with_one_more)
     monkeypatch.setattr(_Work, "refusal", lambda self, effect, step, before: why[effect.name])
+    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.improve"), "rechecked", lambda *of: checked.fit)
     work, steps = _Work(None, None, 0, told.append), [SimpleNamespace()]
     reasons = {"row_noise": "could not be fitted", "frame_offset": "changed nothing by itself"}
-    assert work.first_that_holds(candidates, steps) == (step, reasons)
+    assert work.first_that_holds(candidates, steps) == (checked, reasons)
     assert tried == ["row_noise", "frame_offset", "column_noise"]
     assert told == ["row_noise is left out, could not be fitted", "frame_offset is left out, changed nothing by itself"]
     assert work.first_that_holds(candidates[:2], steps) == (None, reasons)
