@@ -20,6 +20,7 @@ from hsnoise.plots._histograms import _coarse
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._photon_transfer import clipped_fraction
 from hsnoise.plots._row_spectrum import _bands
+from hsnoise.plots._style import new_figure
 from hsnoise.statistics import summarise
 
 EXPOSURES_S = (0.1, 0.4)
@@ -211,3 +212,8 @@ def test_flats_alone_have_a_photon_transfer():
     np.testing.assert_allclose(signal, GAIN * (np.array([20, 100, 500]) + RATE * 0.1), rtol=5 * SIGMA / np.sqrt(3 * 32))
     with pytest.raises(ValueError, match="dark frames"):
         plots.histograms(fit)
+
+
+def test_a_notebook_shows_a_figure_that_is_returned():
+    figure = new_figure(3, 2, "title")
+    assert figure._repr_png_().startswith(b"\x89PNG")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -28,9 +30,18 @@ def title_of(text: str, fit: FitResult) -> str:
     return f"{text}; model without {', '.join(lacking)}" if lacking else text
 
 
+class _ShownFigure(Figure):
+    """A figure that a notebook shows, as those of pyplot are, without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
 def new_figure(width_in: float, height_in: float, title: str) -> Figure:
     """An empty figure whose parts make room for each other."""
-    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    figure = _ShownFigure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=12, wrap=True)
     return figure
 
