@@ -9,11 +9,13 @@ import sys
 import types
 from pathlib import Path
 
+import av
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
+from astropy.io import fits
 from skimage.data import astronaut, coffee
 from skimage.io import imsave
 
@@ -26,6 +28,7 @@ BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE, WORDS = {"python", "sh", "console"}, {"text"}
 # Long work in little: added to the command, the last of an option counts.
 IN_LITTLE = {
+    "demo": ["--max-steps", "0"],
     "improve": ["--max-steps", "0"],
     "train": ["--steps", "2", "--preset", "smoke"],
     "evaluate": ["--no-rivals", "--crop", "32"],
@@ -57,6 +60,10 @@ def without_numbers(text: str) -> list[str]:
 def folder(tmp_path, monkeypatch) -> Path:
     """A fresh folder with what a reader has: frames of a camera, a picture, videos."""
     night = hsnoise.examples.st8(tmp_path / "night")
+    for path in night.rglob("*.fits.fz"):  # a quarter of the pixels: pages draw hundreds of such captures
+        with fits.open(path) as file:
+            middle, header = file[1].data[60:180, 80:240], file[1].header
+        fits.CompImageHDU(middle, header).writeto(path, overwrite=True)
     for name in ("dark3s", "dark25s", "flat3s"):
         of = tmp_path / ("flats" if name == "flat3s" else "darks")
         of.mkdir(exist_ok=True)
@@ -68,6 +75,12 @@ def folder(tmp_path, monkeypatch) -> Path:
     drawn = [hsnoise.sample_dark(i, 4, (64, 96), camera, exposure_s=t) for i, t in enumerate(exposures_s)]
     zarr.save(str(tmp_path / "darks.zarr"), np.stack(drawn))
     imsave(tmp_path / "scene.png", astronaut()[:192, :256], check_contrast=False)
+    with av.open(str(tmp_path / "dark.mp4"), "w") as file:
+        stream = file.add_stream("libx264", rate=25, options={"qp": "0"})
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for frame in np.random.default_rng(0).integers(0, 90, (4, 96, 128, 3)).astype(np.uint8):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        file.mux(stream.encode())
     (tmp_path / "clips").mkdir()
     for i in range(4):
         frames = np.stack([coffee()[20 * i : 20 * i + 96, 3 * f : 3 * f + 128] for f in range(12)])

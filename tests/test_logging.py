@@ -84,7 +84,7 @@ def test_an_improvement_tells_what_is_tried_and_the_error_so_far(few_candidates,
     assert heard[0] == stages[0] == told[0] == "Fitting the first model" and len(heard) > len(stages)
     assert [sentence for sentence in told if sentence in heard] == stages
     assert any(message.startswith("Error ") and message.endswith(" with the first model") for message in told)
-    assert told[-1] == f"Improved: {story.conclusion}" and capfd.readouterr() == ("", "")
+    assert told[-1] == f"Improved: {story.ended}" and capfd.readouterr() == ("", "")
 
 
 def test_the_library_is_silent_until_it_is_asked(tmp_path):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import cli, plots, report
+from hsnoise import _demo, criticism, plots, report
 from hsnoise import effects as fx
 from hsnoise.cli import main
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
@@ -355,8 +356,8 @@ def test_a_story_that_is_broken_off_has_its_page(command, tmp_path, monkeypatch,
         pages.append((out / "report.html").read_text())
         return ended
 
-    monkeypatch.setattr(hsnoise, "improve", improve)
-    monkeypatch.setattr(cli, "_can_be_improved", lambda *_: True)
+    monkeypatch.setattr(criticism, "improve", improve)
+    monkeypatch.setattr(_demo, "fit_with_progress", lambda *_: SimpleNamespace(has_gain=True))
     given = ["--data", str(darks)] if command == "demo" else [str(darks), "--report", str(out / "report.html")]
     assert main([command, *given, "--out", str(out), "--debug"]) == 0
     assert "Not finished" in Elements(pages[0]).text and "darks.npz" in pages[0]

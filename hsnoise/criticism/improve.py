@@ -91,9 +91,8 @@ def improve(
             continue
         if ended:
             break
-    story = Story(tuple(steps), ended, split)
-    log.info("Improved: %s", story.conclusion)
-    return story
+    log.info("Improved: %s", ended)
+    return Story(tuple(steps), ended, split)
 
 
 class _TimeIsUp(Exception):
