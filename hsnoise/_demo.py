@@ -65,8 +65,9 @@ def _improved(
     limits: dict[str, float | None],
     truth: NoiseModel | None = None,
 ) -> None:
-    print("Fitting them, finding what the model lacks, and fitting again: a few minutes ...", flush=True)
     page = args.out / "report.html"
+    print(f"Fitting them, finding what the model lacks, and fitting again: a few minutes. {page}, for a", flush=True)
+    print("browser, tells the story so far, with figures, after each step.", flush=True)
     story = improve_with_progress(stack, SEED, args.out, source, page=page, **limits)
     foot = [f"Written to {args.out}/: {', '.join([*keep(story, args.out, source), 'story.png'])}"]
     write_figure(args.out / "story.png", story.plot())
@@ -74,7 +75,7 @@ def _improved(
     if truth is not None:
         foot = [*OFF_BY.splitlines(), *foot]
         foot.append(f"Hidden in these frames was {HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
-    foot.append(f"All of this is on one page, for a browser: {page}")
+    foot.append(f"All of this is on one page, with figures, for a browser: {page}")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
     foot.append(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
     tell(page_of_story(story, truth), foot, args.verbose)
