@@ -16,6 +16,7 @@ from hsnoise._interrupting import unfinished
 
 FRAME_FORMATS = (".npz", ".npy", ".tif", ".tiff", ".fits")
 _EXPOSURE_TIME_TAG, _RATIONAL = 33434, 5
+MOST_DENOMINATOR = 2**32 - 1  # of a rational number in a tag
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:
@@ -86,7 +87,7 @@ def _write_fits(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, A
 def _write_tiff(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, Any]) -> None:
     import tifffile
 
-    exposure_s = Fraction(float(metadata["exposure_s"][0])).limit_denominator(10**6)
+    exposure_s = Fraction(float(metadata["exposure_s"][0])).limit_denominator(MOST_DENOMINATOR)
     tag = (_EXPOSURE_TIME_TAG, _RATIONAL, 1, exposure_s.as_integer_ratio(), True)
     with tifffile.TiffWriter(buffer) as file:
         for frame in frames:

@@ -46,6 +46,7 @@ def read_capture(
     read, about_kinds = with_kinds(read, kind, root)
     read, about_exposures = _with_exposures_of_names(read, root)
     if cfa is not None:
+        _warn_of_another_cfa(read, cfa)
         read = [replace(one, cfa=cfa) for one in read]
     found = sort_out(read, root)
     _check_exposures([*found.main, *found.elsewhere], source)
@@ -115,6 +116,15 @@ def _warn_of_other_exposures(read: list[Recording], given: list[float]) -> None:
         if own is not None and abs(value - own) > RELATIVE_TOLERANCE * own:
             warnings.warn(
                 f"exposure_s: {recording.path} says {own:g} s; the given {value:g} s are taken instead", stacklevel=4
+            )
+            return
+
+
+def _warn_of_another_cfa(read: list[Recording], given: str) -> None:
+    for recording in read:
+        if recording.cfa not in (None, UNKNOWN_ORDER, given):
+            warnings.warn(
+                f"cfa: {recording.path} says {recording.cfa}; the given {given} is taken instead", stacklevel=4
             )
             return
 

@@ -19,6 +19,11 @@ TEMPERATURE = ("CCD-TEMP", "CCDTEMP", "CCD_TEMP", "DET-TEMP", "DETTEMP", "SENSTE
 GAIN = ("GAIN", "CCDGAIN", "GAINRAW")
 COMBINED = ("NCOMBINE", "STACKCNT", "NSTACK", "NIMAGES")
 OVERSCAN = ("BIASSEC", "OSCANSEC")
+UNITS_S = {  # in comments of exposures
+    r"\b(ms|msecs?|milli-?sec\w*)\b": 1e-3,
+    r"\b([uµ]s|usecs?|micro-?sec\w*)\b": 1e-6,
+    r"\bminutes?\b": 60.0,
+}
 LEAST_E, MOST_E = 0.1, 10.0  # electrons per DN that a number without a unit may be
 ELECTRONS_PER_DN = re.compile(r"\be(lectrons?)?-?\s*(/|per)\s*(adu|dn|count)", re.IGNORECASE)
 
@@ -26,7 +31,7 @@ ELECTRONS_PER_DN = re.compile(r"\be(lectrons?)?-?\s*(/|per)\s*(adu|dn|count)", r
 def described(header: fits.Header, size: tuple[int, int]) -> dict[str, Any]:
     """Fields of a `Recording` with frames of `size` (rows, columns)."""
     kind = kind_of(_text(header, KIND))
-    exposure_s = _number(header, EXPOSURE)
+    exposure_s = _exposure_s(header)
     return {
         "exposure_s": exposure_s,
         "kind": kind_of(_text(header, ("OBJECT",)), calibration_only=True) if kind is None else kind,
@@ -41,6 +46,16 @@ def described(header: fits.Header, size: tuple[int, int]) -> dict[str, Any]:
         "overscan": _section(_text(header, OVERSCAN), size),
         "taken": _text(header, ("DATE-OBS",)),
     }
+
+
+def _exposure_s(header: fits.Header) -> float | None:
+    """The exposure in seconds, or in the unit that its comment names."""
+    for name in EXPOSURE:
+        value = _number(header, (name,))
+        if value is not None:
+            comment = header.comments[name]
+            return value * next((factor for unit, factor in UNITS_S.items() if re.search(unit, comment, re.I)), 1.0)
+    return None
 
 
 def stated_gain(header: fits.Header) -> StatedGain | None:

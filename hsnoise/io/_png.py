@@ -11,6 +11,7 @@ from hsnoise.io._recording import Recording, lazy_frames, naming
 
 EXPOSURE_FROM = "PNG files, which hold none"
 _DTYPES = {"I;16": np.uint16, "L": np.uint8}
+_DEPTH_AT = 24  # byte of the file that holds the bits of a sample
 
 
 def read(path: Path) -> list[Recording]:
@@ -28,4 +29,6 @@ def read(path: Path) -> list[Recording]:
 
 def _read_frame(path: Path, _index: int) -> np.ndarray:
     with Image.open(path) as image:
-        return np.asarray(image)
+        counts = np.asarray(image)
+    depth = path.read_bytes()[_DEPTH_AT] if counts.dtype == np.uint8 else 8
+    return counts // (255 // (2**depth - 1))  # Pillow stretches 2 and 4 bits to 8

@@ -89,6 +89,12 @@ def _read_named(path: Path, read: Any, index: int) -> np.ndarray:
         return read(path, index)
 
 
+def _in_seconds(value: Any) -> np.ndarray:
+    """Time spans of any unit as seconds; all else as it is."""
+    array = np.asarray(value)
+    return array / np.timedelta64(1, "s") if array.dtype.kind == "m" else array
+
+
 def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> list[Recording]:
     """One `Recording` for each exposure group of an array file with named metadata.
 
@@ -103,7 +109,7 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
     """
     per_group = {}
     for name in ("exposure_s", "kind", "temperature_c"):
-        values = np.atleast_1d(metadata[name]).tolist() if name in metadata else [None] * len(groups)
+        values = np.atleast_1d(_in_seconds(metadata[name])).tolist() if name in metadata else [None] * len(groups)
         if len(values) != len(groups) and (len(values) > 1 or name == "exposure_s"):
             raise ValueError(f"{name}: expected {len(groups)} values (one an exposure), got {len(values)}")
         per_group[name] = values * len(groups) if len(values) < len(groups) else values

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tifffile
 
+from hsnoise._frames import LazyFrames
 from hsnoise._types import BAYER_CFAS
 from hsnoise.io._recording import UNKNOWN_ORDER, Recording, lazy_frames, naming
 
@@ -17,10 +19,10 @@ _CFA_PHOTOMETRIC = 32803
 
 
 def read(path: Path) -> list[Recording]:
-    """The pages of a TIFF file as frames of one exposure; exposure, ISO and Bayer order from its tags.
+    """The pages of a TIFF file as frames, those of one exposure and ISO together; Bayer order from the first page.
 
     Raises:
-        ValueError: unreadable, truncated, colour pages, or pages of several sizes.
+        ValueError: unreadable, truncated, colour pages, pages of several sizes, an exposure or ISO that is none.
     """
     with naming(path), tifffile.TiffFile(path) as file:
         pages = [page for page in file.pages if not page.is_reduced]  # reduced: a thumbnail
@@ -30,22 +32,32 @@ def read(path: Path) -> list[Recording]:
         end, size = max(_next_page(file), *map(_end, pages)), path.stat().st_size
         if end > size:
             raise ValueError(f"truncated: {size} bytes, its tags promise {end}")
-        tags = _tags(pages[0])
-        counts = lazy_frames(path, _read_frame, len(pages), pages[0].shape, pages[0].dtype)
+        first = _tags(pages[0])
+        groups: dict[tuple[float | None, float | None], list[int]] = {}
+        for page in pages:
+            tags = first | _tags(page)  # what a page does not say is as on the first
+            groups.setdefault((_exposure_s(tags), _iso(tags)), []).append(page.offset)
         return [
             Recording(
                 path=path,
-                counts=counts,
-                exposure_s=_number(tags.get("ExposureTime")),
-                iso=_number(tags.get("ISOSpeedRatings", tags.get("PhotographicSensitivity"))),
-                cfa=_cfa(pages[0], tags),
+                counts=_frames(path, places, pages[0]),
+                exposure_s=exposure_s,
+                iso=iso,
+                cfa=_cfa(pages[0], first),
             )
+            for (exposure_s, iso), places in groups.items()
         ]
 
 
-def _read_frame(path: Path, index: int) -> np.ndarray:
+def _frames(path: Path, places: list[int], page: Any) -> LazyFrames:
+    return lazy_frames(path, partial(_read_frame, places=tuple(places)), len(places), page.shape, page.dtype)
+
+
+def _read_frame(path: Path, index: int, *, places: tuple[int, ...]) -> np.ndarray:
+    """The page whose directory lies at `places[index]`: to walk through all before it would take quadratic time."""
     with tifffile.TiffFile(path) as file:
-        return [page for page in file.pages if not page.is_reduced][index].asarray()
+        file.filehandle.seek(places[index])
+        return tifffile.TiffPage(file, index).asarray()
 
 
 def _next_page(file: tifffile.TiffFile) -> int:
@@ -66,13 +78,26 @@ def _tags(page: Any) -> dict[str, Any]:
     return tags | tags.get("ExifTag", {})
 
 
-def _number(value: Any) -> float | None:
-    """A tag's number: rationals are pairs."""
+def _exposure_s(tags: dict[str, Any]) -> float | None:
+    """The exposure, a rational: a pair of whole numbers."""
+    value = tags.get("ExposureTime")
     if value is None:
         return None
-    if isinstance(value, tuple):
-        return float(value[0] / value[1]) if len(value) == 2 and value[1] else float(value[0])
-    return float(value)
+    if not isinstance(value, tuple):
+        return float(value)
+    if len(value) != 2 or not value[1]:
+        raise ValueError(f"ExposureTime: expected one rational number of seconds, got {value}")
+    return float(value[0] / value[1])
+
+
+def _iso(tags: dict[str, Any]) -> float | None:
+    """The ISO; 0 stands for unknown. Some cameras write it twice."""
+    value = tags.get("ISOSpeedRatings", tags.get("PhotographicSensitivity"))
+    numbers = set(value) if isinstance(value, tuple) else {value}
+    if len(numbers) > 1:
+        raise ValueError(f"ISOSpeedRatings: expected one number, got {value}")
+    (one,) = numbers
+    return float(one) if one else None
 
 
 def _cfa(page: Any, tags: dict[str, Any]) -> str | None:

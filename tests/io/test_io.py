@@ -240,7 +240,7 @@ def test_named_arrays(tmp_path, suffix):
     assert stack.is_lazy(0) == (suffix == "h5")
     for i in range(2):
         np.testing.assert_array_equal(read_all(stack, i), counts[1 - i])
-    with pytest.warns(UserWarning, match="exposure_s: "):  # told, and taken
+    with pytest.warns(UserWarning, match="exposure_s: "), pytest.warns(UserWarning, match="cfa: "):  # told, and taken
         given = load(tmp_path, exposure_s=[1, 1.0005], shutter="rolling", cfa="mono", black_level=7, white_level=999)
     assert given.n_frames == (6,) and given.shutter == "rolling" and given.cfa == "mono"
     assert given.black_level == 7 and given.white_level == 999
