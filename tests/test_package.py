@@ -93,6 +93,17 @@ def installed(wheel, tmp_path_factory) -> Path:
     return commands
 
 
+def beside(installed: Path, folder: Path, package: str) -> Path:
+    """Python of an environment of its own that sees the installed wheel and has one package more."""
+    venv.create(folder, with_pip=True)
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    where = "import site; print(site.getsitepackages()[0])"
+    shared, own = (run(one, "-c", where, cwd=folder).strip() for one in (installed / "python", python))
+    (Path(own) / "shared.pth").write_text(shared)
+    run(python, "-m", "pip", "install", "-q", package, cwd=folder)
+    return python
+
+
 def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
@@ -156,22 +167,22 @@ def test_a_folder_of_fits_files_is_fitted_in_three_commands(installed, tmp_path)
 @pytest.mark.slow
 def test_the_readme_runs_from_the_wheel(installed, tmp_path):
     """Each command and each line of Python of the README, in order, where only the wheel is installed."""
-    run(installed / "python", "-m", "pip", "install", "-q", "av", cwd=tmp_path)  # the extra for video
+    python = beside(installed, tmp_path / "own", "av")  # the extra for video
     made = "import hsnoise, shutil; hsnoise.examples.st8('night'); shutil.copytree('night', 'darks');"
     made += " shutil.move('darks/flat3s', 'flats')"
     scene = "; from skimage import data, io; io.imsave('scene.png', data.astronaut()[:192, :256])"
-    run(installed / "python", "-c", made + scene, cwd=tmp_path)
+    run(python, "-c", made + scene, cwd=tmp_path)
     little = {"improve": ["--max-steps", "0"], "demo": ["--max-steps", "0"]}
     ran = 0
     for language, block in re.findall(r"^```(python|sh)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.M | re.S):
         if language == "python":
-            run(installed / "python", "-c", f"import numpy as np\n{block}", cwd=tmp_path)
+            run(python, "-c", f"import numpy as np\n{block}", cwd=tmp_path)
             ran += 1
             continue
         for line in block.splitlines():
             program, *words = shlex.split(line, comments=True) or [""]
             if program == "hsnoise":
-                run(installed / "hsnoise", *words, *little.get(words[0], []), cwd=tmp_path)
+                run(python, "-m", "hsnoise", *words, *little.get(words[0], []), cwd=tmp_path)
                 ran += 1
     assert ran >= 10
 
@@ -188,12 +199,7 @@ def test_what_belongs_to_an_extra_names_it(installed, tmp_path):
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
 def test_every_extra_works_alone(installed, wheel, tmp_path, extra):
     """In an environment of its own, which sees the package but no other extra."""
-    venv.create(tmp_path / "own", with_pip=True)
-    python = tmp_path / "own" / "bin" / "python"
-    shared = run(installed / "python", "-c", "import site; print(site.getsitepackages()[0])", cwd=tmp_path).strip()
-    own = run(python, "-c", "import site; print(site.getsitepackages()[0])", cwd=tmp_path).strip()
-    (Path(own) / "shared.pth").write_text(shared)
-    run(python, "-m", "pip", "install", "-q", f"{wheel}[{extra}]", cwd=tmp_path)
+    python = beside(installed, tmp_path / "own", f"{wheel}[{extra}]")
     run(python, "-c", USES.get(extra, "import hsnoise"), cwd=tmp_path)
 
 
