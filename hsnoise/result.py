@@ -84,10 +84,7 @@ class FitResult:
         if not self.converged:
             return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
         if not self.doubts:
-            return Conclusion(
-                Light.GREEN,
-                "Nothing in these frames contradicts these numbers. Compare tells whether draws look like the frames.",
-            )
+            return Conclusion(Light.GREEN, AGREES)
         first = self.doubts[0]
         others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
         # That there is no gain is no error: noise in DN can be used.
