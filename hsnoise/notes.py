@@ -24,13 +24,13 @@ DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
 def closing_notes(result: FitResult) -> tuple[str, ...]:
     """All sentences that belong under the table of `result`."""
     misfit = _misfit_notes(result) if result.summary.histograms else flat_notes(result)
-    circumstances = (note(result) for note in (_left_out_note, _order_note, _warming_note, _light_note))
+    circumstances = (note(result) for note in (_left_out_note, order_note, _warming_note, _light_note))
     return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
 
 
 def pixel_notes(result: FitResult) -> tuple[str, ...]:
     """Sentences under the table of a fit that is conditional on the pixel: no histogram of pooled pixels is its own."""
-    circumstances = (note(result) for note in (_order_note, _warming_note, _light_note))
+    circumstances = (note(result) for note in (order_note, _warming_note, _light_note))
     return (*parameter_notes(result), *chain.from_iterable(circumstances))
 
 
@@ -152,7 +152,7 @@ def _left_out_note(result: FitResult) -> list[str]:
     return [f"To save memory, this fit rests on {frames}{rows}; the standard errors are those of what was used."]
 
 
-def _order_note(result: FitResult) -> list[str]:
+def order_note(result: FitResult) -> list[str]:
     """Means that fall where the exposure grows."""
     for h in result.summary.histograms:
         order = np.argsort(result.summary.exposure_s, kind="stable")

@@ -77,7 +77,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         )
         params = _model(wanted, physics, population, summary, pixel)
     names, covariance = _covariance(pixel, params, population, black[1], row)
-    withheld = () if pixel.determined else tuple(n for n in params.table if _in_electrons(n))
+    withheld = () if pixel.determined else tuple(n for n in params.table if in_electrons(n))
     errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
     unknown = [name for name, error in errors.items() if name.startswith("row_gain.sigma") and error > 1]
     if np.ptp(summary.exposure_s) == 0 and "dark_current" in params:
@@ -101,7 +101,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     )
 
 
-def _in_electrons(name: str) -> bool:
+def in_electrons(name: str) -> bool:
     """Whether a parameter has no value without the gain."""
     effect = name.split(".")[0]
     return name.startswith(IN_ELECTRONS) or effect in set(POPULATION) - IN_OTHER_UNITS

@@ -15,10 +15,11 @@ import numpy as np
 from hsnoise.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
 from hsnoise.doubts._drawn import disagreements
 from hsnoise.doubts._evidence import Evidence
-from hsnoise.doubts._stated import stated
+from hsnoise.doubts._stated import header_gain, stated
 from hsnoise.flat_notes import gain_notes
-from hsnoise.notes import pixel_notes
+from hsnoise.notes import order_note, pixel_notes
 from hsnoise.pixel_fit import PixelFit
+from hsnoise.pixel_result import in_electrons
 from hsnoise.pixels.oddities import lit_darks, oddities_of, pixels_apart
 from hsnoise.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.pixels.survey import Survey
@@ -27,6 +28,8 @@ from hsnoise.result import FitResult
 
 __all__ = ["Evidence", "carries_no_gain", "checked", "confirmed"]
 
+OPEN = 1.0  # error of a gain over itself from which nothing is known of it
+ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
@@ -36,24 +39,46 @@ STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for nois
 
 def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and the notes of what it does not determine."""
-    found = seen.survey
+    found, result = seen.survey, _without_open_gain(result)
     checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
     share = _outlier_share(result)
-    minor = (*pixels_apart(found), *lit_darks(found), *_outliers(result), *_moved_pedestals(result), *_many_hot(result))
+    minor = (
+        *header_gain(result),
+        *order_note(result),
+        *pixels_apart(found),
+        *lit_darks(found),
+        *_outliers(result),
+        *_moved_pedestals(result),
+        *_many_hot(result),
+    )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
     if result.method == "transfer":
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
+    notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
+
+
+def _without_open_gain(result: FitResult) -> FitResult:
+    """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
+    gains = [(value, error) for name, (value, error, _) in result.table.items() if name.split(".")[0] == "gain"]
+    if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error in gains):
+        return result
+    names = tuple(name for name in result.params.table if in_electrons(name))
+    return replace(result, withheld=tuple(dict.fromkeys((*result.withheld, *names))))
 
 
 def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     """Which parameters are withheld, what is known instead, and which capture would determine them."""
     if result.has_gain:
         return
-    pixel: PixelFit = result.transfer
+    pixel: PixelFit | None = result.transfer
+    if pixel is None:
+        read_dn = float(np.mean(np.asarray(result.physics.gain)) * result.physics.read_noise)
+        yield f"The gain is not determined: nothing in these darks tells it. Read noise is {read_dn:.4g} DN. {ADD}"
+        return
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
     error = float(np.sqrt(np.mean([c.covariance[1, 1] for c in pixel.channels]) / len(pixel.channels)))
     read_dn = np.sqrt(max(floor - ROUNDING, 0.0))
@@ -72,8 +97,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         why = "the dark signal of ordinary pixels does not grow with exposure by enough"
     yield (
         f"The gain is not determined: {why}. {_named_noise(found)} is {read_dn:.4g} ±"
-        f" {error / max(2 * read_dn, 1e-9):.2g} DN. Add"
-        " flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
+        f" {error / max(2 * read_dn, 1e-9):.2g} DN. {ADD}"
     )
 
 

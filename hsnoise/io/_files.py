@@ -67,7 +67,12 @@ def _below(root: Path) -> tuple[list[Path], list[str]]:
     """Files of known formats in a folder and the folders in it, in natural order, but for those of `PASSED_OVER`."""
     found: list[Path] = []
     told = []
-    for folder, inside, names in os.walk(root):
+    seen: set[str] = set()
+    for folder, inside, names in os.walk(root, followlinks=True):
+        if os.path.realpath(folder) in seen:  # a link that leads back
+            inside[:] = []
+            continue
+        seen.add(os.path.realpath(folder))
         passed = sorted(name for name in inside if name.lower() in PASSED_OVER)
         told += [f"{(Path(folder) / name).relative_to(root)}/ was passed over because of its name" for name in passed]
         inside[:] = [name for name in inside if name not in passed and not name.startswith((".", "hsnoise-"))]
