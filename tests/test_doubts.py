@@ -109,3 +109,12 @@ def test_flats_of_unequal_light_are_not_taken_for_smoothed(good):
     flats = hsnoise.FrameStack(counts.astype(np.uint16)[None], exposure_s=(1.0,), kind="flat")
     fit = hsnoise.fit(hsnoise.FrameStack.join(good.stack, flats))
     assert not any("smoothed" in doubt for doubt in fit.doubts), fit.doubts
+
+
+def test_a_gain_that_nothing_tells_is_withheld_by_the_likelihood_too(rng):
+    """Bias frames alone: 1.0 ± 18.9 DN/e- had been printed with a green light."""
+    counts = np.rint(500 + 6.0 * rng.normal(size=(12, 96, 128)) + 0.8 * rng.normal(size=(12, 96, 1))).astype(np.uint16)
+    fit = hsnoise.fit(counts, exposure_s=[0.0])
+    assert np.isnan(fit.table["gain"][0]) and not fit.has_gain and not fit.trustworthy
+    assert fit.conclusion.light == "amber" and "The gain is not determined" in fit.conclusion.sentence
+    assert "Read noise is 6." in fit.doubts[0]

@@ -21,12 +21,15 @@ ROW_SIGMAS, TOGETHER = 6.0, 0.3  # of what a row shares, that the next one has, 
 
 def stated(result: FitResult, seen: Evidence) -> Iterator[str]:
     """All that was given and that the frames contradict."""
+    gain = None if result.stack is None else result.stack.stated_gain
+    if gain is not None and gain.certain:
+        yield from header_gain(result)
     for check in (_black_level, _white_level, _mosaic, _shutter):
         yield from check(result, seen)
 
 
 def header_gain(result: FitResult) -> Iterator[str]:
-    """A gain that the header states, against the fitted one: the frames are believed."""
+    """A gain that the header states, against the fitted one; where it may be a nominal one, the frames are believed."""
     if result.stack is None or not result.has_gain:
         return
     rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
