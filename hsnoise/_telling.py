@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -37,6 +36,7 @@ OPTIONS = {
     "params": "--model",
     "seed": "--seed",
 }
+WORDS = ("added", "effect", "group of statistics", "worst group")  # headings of columns of text
 COLOURS = {Light.GREEN: "green", Light.AMBER: "yellow", Light.RED: "red"}
 
 
@@ -106,26 +106,20 @@ def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | 
 
 
 def page_of_comparison(found: Comparison) -> Page:
-    table = _table("group of statistics", "misfit")
-    for name, misfit in sorted(found.groups.items(), key=lambda item: -item[1]):
-        table.add_row(name, f"{misfit:.2f}")
     sentences = (*found.worst, *explained(found.worst), *found.skipped)
     return Page(
         found.conclusion,
-        tables=(table,),
+        tables=(_plain(found.as_table()),),
         notes=tuple(f"- {one}" for one in found.worst),
         rest=(found.measure, *(f"- {one}" for one in sentences[len(found.worst) :])),
     )
 
 
 def page_of_diagnosis(found: Diagnosis) -> Page:
-    table = _table("effect", "score / nats", "p", "z left")
-    for one in found.ranking[:5]:
-        table.add_row(one.name, f"{one.score:z.1f}", one.chance, f"{one.misfit:z.1f}")
     rest = (found.remains, LEGEND)
     return Page(
         found.conclusion,
-        tables=(table,),
+        tables=(_plain(found.as_table()),),
         notes=tuple(f"- {one}" for one in found.sentences),
         rest=tuple(f"- {one}" for one in rest if one),
     )
@@ -133,16 +127,11 @@ def page_of_diagnosis(found: Diagnosis) -> Page:
 
 def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
     """The steps, and the last fit."""
-    table = _table("step", "added", "error", "held-out / nats", "worst group")
-    for i, step in enumerate(story.steps):
-        worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
-        held_out = "" if np.isnan(step.held_out) else f"{step.held_out:.1f}"
-        table.add_row(str(i), step.added or story.start, f"{step.comparison.error:.2f}", held_out, worst)
     fit = page_of_fit(story.fit, truth=truth)
     return Page(
         conclusion=story.conclusion,
         doubts=_unsaid(story.fit.doubts, story.conclusion),
-        tables=(table, *fit.tables),
+        tables=(_plain(story.as_table()), *fit.tables),
         notes=tuple(one for one in (story.care, *fit.notes) if one),
         rest=tuple(one for one in (*story.details, story.ended, story.split) if one),
         colour=fit.colour,
@@ -172,11 +161,11 @@ def _light(conclusion: Conclusion, console: Console) -> Text:
     return Text.assemble(("● ", f"bold {COLOURS[conclusion.light]}"), (conclusion.sentence, "bold"))
 
 
-def _table(*headings: str) -> Table:
-    table = Table(box=SIMPLE_HEAD)
-    for heading in headings:
-        is_text = heading in ("added", "effect", "group of statistics", "worst group")
-        table.add_column(heading, justify="left" if is_text else "right")
+def _plain(table: Table) -> Table:
+    """A result's table without its grid, numbers to the right."""
+    table.box = SIMPLE_HEAD
+    for column in table.columns:
+        column.justify = "left" if column.header in WORDS else "right"
     return table
 
 

@@ -100,7 +100,8 @@ class Comparison:
         """
         return data_frame(self, ("statistic", "group", "measured", "model", "z"), self.table)
 
-    def _misfits(self) -> Table:
+    def as_table(self) -> Table:
+        """Misfit of each group, the worst first, as it is printed."""
         table = Table("group of statistics", "misfit")
         for name, misfit in sorted(self.groups.items(), key=lambda item: -item[1]):
             table.add_row(name, f"{misfit:.2f}")
@@ -110,7 +111,7 @@ class Comparison:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(self.measure, highlight=False)
-        console.print(self._misfits())
+        console.print(self.as_table())
         for sentence in (*self.worst, *explained(self.worst), *self.skipped):
             console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
@@ -121,7 +122,7 @@ class Comparison:
         return _html.fragment(
             _html.conclusion(self.conclusion),
             _html.paragraph(self.measure),
-            _html.printed(self._misfits()),
+            _html.printed(self.as_table()),
             _html.sentences(self.worst),
             _html.details("About the statistics", _html.sentences((*explained(self.worst), *self.skipped))),
         )

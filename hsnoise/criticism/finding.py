@@ -112,7 +112,8 @@ class Diagnosis:
         rows = ((c.name, c.score, c.p_value, c.misfit) for c in self.ranking)
         return data_frame(self, ("effect", "score_nats", "p", "z_left"), rows)
 
-    def _leaders(self) -> Table:
+    def as_table(self) -> Table:
+        """The leaders of the ranking, as they are printed."""
         table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:z.1f}", c.chance, f"{c.misfit:z.1f}")
@@ -121,7 +122,7 @@ class Diagnosis:
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(str(self.conclusion), markup=False, highlight=False)
-        console.print(self._leaders())
+        console.print(self.as_table())
         for sentence in (LEGEND, *self.sentences, self.remains):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
@@ -133,7 +134,7 @@ class Diagnosis:
         remains = [sentence for sentence in (self.remains,) if sentence]
         return _html.fragment(
             _html.conclusion(self.conclusion),
-            _html.printed(self._leaders()),
+            _html.printed(self.as_table()),
             _html.sentences(self.sentences),
             _html.details("What the columns mean, and what is left", _html.sentences((LEGEND, *remains))),
         )

@@ -164,7 +164,8 @@ class Story:
             worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
             yield i, step.added or self.start, step.comparison.error, step.held_out, worst
 
-    def _table(self) -> Table:
+    def as_table(self) -> Table:
+        """The steps, as they are printed."""
         table = Table("step", "added", "error", "held-out / nats", "worst group")
         for i, added, error, held_out, worst in self._rows():
             table.add_row(str(i), added, f"{error:.2f}", "" if np.isnan(held_out) else f"{held_out:.1f}", worst)
@@ -172,7 +173,7 @@ class Story:
 
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
-        console.print(str(self.conclusion), self._table(), sep="\n", highlight=False, markup=False)
+        console.print(str(self.conclusion), self.as_table(), sep="\n", highlight=False, markup=False)
         for sentence in (*self.details, *self._closing):
             console.print(sentence, highlight=False, markup=False)
         return console.file.getvalue().rstrip()
@@ -183,7 +184,7 @@ class Story:
         steps = [(self._reason(i), (*step.sizes, *step.moved)) for i, step in enumerate(self.steps)]
         return _html.fragment(
             _html.conclusion(self.conclusion),
-            _html.printed(self._table()),
+            _html.printed(self.as_table()),
             _html.details("Why each effect was added", *(_html.sentences(told, reason) for reason, told in steps)),
             _html.details("How it ended", _html.sentences(self._closing)),
         )

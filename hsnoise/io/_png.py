@@ -30,5 +30,6 @@ def read(path: Path) -> list[Recording]:
 def _read_frame(path: Path, _index: int) -> np.ndarray:
     with Image.open(path) as image:
         counts = np.asarray(image)
-    depth = path.read_bytes()[_DEPTH_AT] if counts.dtype == np.uint8 else 8
+    with path.open("rb") as file:
+        depth = file.read(_DEPTH_AT + 1)[_DEPTH_AT] if counts.dtype == np.uint8 else 8
     return counts // (255 // (2**depth - 1))  # Pillow stretches 2 and 4 bits to 8

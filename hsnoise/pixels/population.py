@@ -149,10 +149,13 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     edges = middle + np.append(np.linspace(-6 * core, 6 * core, CORE_BINS), np.geomspace(6.2 * core, far, TAIL_BINS))
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
-    def loss(theta: np.ndarray) -> float:
+    def natural(theta: np.ndarray) -> tuple[float, float, float, float]:
         if middle <= 0:  # no dark current of ordinary pixels, which could differ
             theta = np.array([0.0, np.log(1e-3), *theta[2:]])
-        cdf = growth_cdf(edges, noise, *_natural(theta, core))
+        return _natural(theta, core)
+
+    def loss(theta: np.ndarray) -> float:
+        cdf = growth_cdf(edges, noise, *natural(theta))
         return -float(counts @ np.log(np.maximum(np.diff(np.concatenate([[0.0], cdf, [1.0]])), 1e-12)))
 
     excess = growth[growth > middle + 6 * core] - middle
@@ -161,7 +164,7 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     theta = np.array([middle / core, np.log(0.2), np.log(share / (MOST_HOT - share)), np.log(rate / core)])
     for _ in range(2):
         theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
-    values = np.array(_natural(theta, core))
+    values = np.array(natural(theta))
     units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3]])
     errors = _errors(loss, theta) * units
     alike, cool = theta.copy(), theta.copy()
