@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import builtins
+import importlib
 import os
 from pathlib import Path
 
@@ -9,6 +11,8 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
+
+from hsnoise.criticism import candidates
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -52,3 +56,27 @@ def shared_data() -> Path:
         if (place / "data").is_dir():
             return place
     pytest.skip(f"no captures: looked for data/ in {', '.join(map(str, places))}; set HSNOISE_SHARED")
+
+
+@pytest.fixture
+def few_candidates(monkeypatch, request):
+    """A library of the effects that the test's module names in FEW, for time's sake."""
+    whole = candidates.built_in
+
+    def some(model, darks):
+        return {name: maker for name, maker in whole(model, darks).items() if name in request.module.FEW}
+
+    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.diagnose"), "built_in", some)
+
+
+@pytest.fixture
+def no_pandas(monkeypatch):
+    """As if pandas were not installed."""
+    real = builtins.__import__
+
+    def without_pandas(name, *args, **keywords):
+        if name == "pandas":
+            raise ImportError(name)
+        return real(name, *args, **keywords)
+
+    monkeypatch.setattr(builtins, "__import__", without_pandas)

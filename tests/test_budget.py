@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import subprocess
 import sys
 import tracemalloc
@@ -252,20 +251,12 @@ def test_standard_errors_in_brackets(value, error, text):
     assert concise(value, error) == text
 
 
-def test_table_goes_to_pandas_or_says_what_is_missing(monkeypatch):
+def test_table_goes_to_pandas_or_says_what_is_missing(no_pandas):
     found = hsnoise.budget(frames(np.random.default_rng(10), 4), exposure_s=[1.0])
     assert len(found.table) == 7
     assert found.table[0]._fields == (
         "exposure_s", "kind", "channel", "component", "variance_dn2", "standard_error_dn2", "share"
     )  # fmt: skip
-    real = builtins.__import__
-
-    def without_pandas(name, *args, **keywords):
-        if name == "pandas":
-            raise ImportError(name)
-        return real(name, *args, **keywords)
-
-    monkeypatch.setattr(builtins, "__import__", without_pandas)
     with pytest.raises(ImportError, match=r"pip install 'hsnoise\[pandas\]'"):
         found.to_pandas()
 

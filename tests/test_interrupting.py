@@ -137,6 +137,15 @@ _output.write_atomically({str(path)!r}, b"new")
     assert os.listdir(tmp_path) == ["model.json"] and path.read_text() == "old"
 
 
+def interrupted_when_ready(code: str) -> tuple[int, str]:
+    """Exit status and standard error of code that is interrupted once it has said that it is ready."""
+    process = start([sys.executable, "-c", AS_COMMAND + code])
+    wait_for(process, "ready")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, err
+
+
 def test_work_that_keeps_what_it_has_is_given_the_exception():
     code = """
 import time
@@ -149,11 +158,7 @@ with _interrupting.as_exception():
         print("kept", file=sys.stderr)
         sys.exit(0)
 """
-    process = start([sys.executable, "-c", AS_COMMAND + code])
-    wait_for(process, "ready")
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, "kept\n")
+    assert interrupted_when_ready(code) == (0, "kept\n")
 
 
 def test_after_the_work_it_changes_nothing():
@@ -165,11 +170,7 @@ print("ready", file=sys.stderr, flush=True)
 time.sleep(2)
 sys.exit(status)
 """
-    process = start([sys.executable, "-c", AS_COMMAND + code])
-    wait_for(process, "ready")
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (2, "")
+    assert interrupted_when_ready(code) == (2, "")
 
 
 def test_other_processes_are_left_as_they_are():

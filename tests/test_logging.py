@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import subprocess
 import sys
 
 import numpy as np
-import pytest
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.criticism import candidates as library
 
 MODEL = hsnoise.NoiseModel(
     [fx.ShotNoise(), fx.DarkCurrent(400.0), fx.ReadNoise(3.0), fx.Gain(2.0), fx.BlackLevel(100.0), fx.ADC()],
@@ -27,17 +24,6 @@ FEW = ("row_noise", "frame_offset")
 def capture(model):
     counts = [np.asarray(hsnoise.sample_dark(i, 6, (32, 48), model, exposure_s=t)) for i, t in enumerate(EXPOSURE_S)]
     return hsnoise.FrameStack(counts, EXPOSURE_S, black_level=100)
-
-
-@pytest.fixture
-def few_candidates(monkeypatch):
-    """A library of two effects, for time's sake."""
-    whole = library.built_in
-
-    def some(model, darks):
-        return {name: maker for name, maker in whole(model, darks).items() if name in FEW}
-
-    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.diagnose"), "built_in", some)
 
 
 def said(caplog, level):

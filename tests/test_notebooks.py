@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -262,15 +261,7 @@ def test_rows_are_those_of_the_result(results, stack):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_without_pandas_the_extra_is_named(results, kind, monkeypatch):
-    real = builtins.__import__
-
-    def without_pandas(name, *args, **keywords):
-        if name == "pandas":
-            raise ImportError(name)
-        return real(name, *args, **keywords)
-
-    monkeypatch.setattr(builtins, "__import__", without_pandas)
+def test_without_pandas_the_extra_is_named(results, kind, no_pandas):
     message = rf"^{kind}\.to_pandas: needs pandas: pip install 'hsnoise\[pandas\]'$"
     with pytest.raises(ImportError, match=message):
         results[kind].to_pandas()

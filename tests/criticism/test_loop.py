@@ -42,17 +42,6 @@ def capture(*effects, seed=900, **layout):
     return draw_capture(seed, model, empty_stack(**layout))
 
 
-@pytest.fixture
-def few_candidates(monkeypatch):
-    """A library of six effects, for time's sake."""
-    whole = library.built_in
-
-    def some(model, darks):
-        return {name: maker for name, maker in whole(model, darks).items() if name in FEW}
-
-    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.diagnose"), "built_in", some)
-
-
 def test_own_samples_have_error_one():
     errors = [hsnoise.compare(MODEL, capture(seed=900 + i), draws=24).error for i in range(3)]
     assert 0.5 < np.median(errors) < 1.8
