@@ -17,7 +17,7 @@ import numpy as np
 import hsnoise
 from benchmarks.simulator import CAMERAS, EXPOSURE_S, Camera, capture
 from hsnoise.criticism.diagnose import Diagnosis
-from hsnoise.result import FitResult
+from hsnoise.fitting.result import FitResult
 
 CLEAN = "none"
 TOP = 3

@@ -11,7 +11,7 @@ from scipy.stats import beta
 
 from benchmarks._grid_cells import CLEAN, hidden_in
 from benchmarks.simulator import ODD
-from hsnoise._sheet import Sheet
+from hsnoise._core.sheet import Sheet
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 WITHIN = 4.0  # standard errors

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hsnoise._sheet import Sheet
+from hsnoise._core.sheet import Sheet
 
 MEAN_DARK = "mean dark current"  # over all pixels, e-/s
 QUANTILE = 1.96  # of the normal law: intervals of 95 %

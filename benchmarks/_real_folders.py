@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 
 import hsnoise
-from hsnoise._sheet import Sheet
+from hsnoise._core.sheet import Sheet
 
 COVERED = "covered"  # by the fit's own 95 % interval
 MOST_ERROR = 1 / 3  # of the value; with a larger one nothing is reached

@@ -17,7 +17,7 @@ import numpy as np
 from rich.progress import track
 
 import hsnoise
-from hsnoise.statistics import channel_planes
+from hsnoise.likelihood.summary import channel_planes
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 

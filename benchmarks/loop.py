@@ -3,8 +3,9 @@
     python -m benchmarks.loop
     python -m benchmarks.loop --effects row_noise,image_lag --no-improve
 
-Times are those after the first compilation in the process: one capture is looked at before the clock starts. The yardstick
-is what NumPy takes for 20 Mpixel of Poisson plus normal draws on the same machine, one thread, in the same run.
+Times are those after the first compilation in the process: one capture is looked at before the clock starts. The
+yardstick is what NumPy takes for 20 Mpixel of Poisson plus normal draws on the same machine, one thread, in the same
+run.
 """
 
 from __future__ import annotations

@@ -30,18 +30,18 @@ from rich.progress import track
 
 import hsnoise
 from hsnoise import NoiseModel
-from hsnoise._output import write_atomically
-from hsnoise._progress import busy
-from hsnoise._sheet import Sheet
-from hsnoise.flat_likelihood import ROUNDING_VARIANCE
-from hsnoise.mosaic import electrons_of
-from hsnoise.photometry import GREY, display_from_linear, light_of_frames
-from hsnoise.training.clips import LONG, Clip, check_sizes, crops, held_out, read_clips
-from hsnoise.training.noisy import Camera, at_exposure, matched
-from hsnoise.training.presets import Recipe
-from hsnoise.training.steps import Trainer, batch_rng, digest_of
-from hsnoise.training.validation import psnr_db
-from hsnoise.weights import load_network, save_network
+from hsnoise._core.output import write_atomically
+from hsnoise._core.sheet import Sheet
+from hsnoise.chain.photometry import GREY, display_from_linear, light_of_frames
+from hsnoise.cli.progress import busy
+from hsnoise.enhance.mosaic import electrons_of
+from hsnoise.enhance.training.clips import LONG, Clip, check_sizes, crops, held_out, read_clips
+from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
+from hsnoise.enhance.training.presets import Recipe
+from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
+from hsnoise.enhance.training.validation import psnr_db
+from hsnoise.enhance.weights import load_network, save_network
+from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
 DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame

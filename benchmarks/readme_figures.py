@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 import hsnoise
 from hsnoise import effects as fx
 from hsnoise import plots
-from hsnoise._output import write_figure
-from hsnoise.draws import darks_of, draw_capture
+from hsnoise._core.output import write_figure
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
+from hsnoise.simulation.draws import darks_of, draw_capture
 
 ROWS, COLUMNS = slice(10, 190), slice(20, 290)  # of the frames that are shown
 STRETCH = (0.5, 99.9)  # percentiles of the measured frame that are black and white

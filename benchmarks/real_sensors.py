@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import hsnoise
-from hsnoise._progress import busy
+from hsnoise.cli.progress import busy
 
 ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 have in common
 REPORTED_GAIN, REPORTED_READ_NOISE_E = 0.422149, 1.98

@@ -29,12 +29,12 @@ from rich.table import Table
 
 import hsnoise
 from hsnoise.effects import ADC
-from hsnoise.physics import evaluate, physics_of
-from hsnoise.plan import CLOSE_MARGIN, plan_rules
-from hsnoise.statistics import summarise, without_counts
-from hsnoise.training.noisy import camera_of
-from hsnoise.training.presets import Recipe
-from hsnoise.training.steps import Trainer, examples
+from hsnoise.enhance.training.noisy import camera_of
+from hsnoise.enhance.training.presets import Recipe
+from hsnoise.enhance.training.steps import Trainer, examples
+from hsnoise.likelihood.physics import evaluate, physics_of
+from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules
+from hsnoise.likelihood.summary import summarise, without_counts
 
 TURN_S = 0.5
 FRAMES, ROWS, COLUMNS = 8, 1024, 1024

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from hsnoise import cli
+from hsnoise.cli import main as cli
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -6,18 +6,22 @@ import logging
 from importlib import import_module
 from typing import Any
 
-from hsnoise import _interrupting, cameras, effects, examples  # noqa: F401  the first is for Ctrl-C during the others
-from hsnoise.budget import NoiseBudget, budget
+from hsnoise._core import interrupting as _interrupting  # noqa: F401  the first is for Ctrl-C during the others
+from hsnoise.chain.photometry import photoelectrons_from_illuminance
 from hsnoise.criticism import compare, diagnose, improve
+from hsnoise.criticism.budget import NoiseBudget, budget
+from hsnoise.criticism.inspection.inspect import inspect
 from hsnoise.effects import AbstractEffect, Stage, param
 from hsnoise.fit import FitResult, fit
-from hsnoise.inspection import inspect
-from hsnoise.io import load
-from hsnoise.likelihood import log_likelihood
+from hsnoise.frames import examples
+from hsnoise.frames.io.load import load
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.joint import log_likelihood
+from hsnoise.likelihood.summary import summarise
 from hsnoise.model import NoiseModel, sample, sample_dark
-from hsnoise.photometry import photoelectrons_from_illuminance
-from hsnoise.stack import FrameStack
-from hsnoise.statistics import summarise
+from hsnoise.simulation import cameras
+
+from . import effects
 
 __version__ = "0.1.0"
 

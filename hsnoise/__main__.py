@@ -2,6 +2,6 @@
 
 import sys
 
-from hsnoise.cli import main
+from hsnoise.cli.main import main
 
 sys.exit(main())

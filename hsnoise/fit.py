@@ -10,27 +10,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
-from hsnoise._source import as_stack
-from hsnoise.coordinates import coordinates_for, labels
-from hsnoise.doubts import Evidence, carries_no_gain, checked, confirmed
-from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
-from hsnoise.flat_gain import judged
-from hsnoise.line import line_fit
-from hsnoise.maximise import maximise
+from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, confirmed
+from hsnoise.fitting.line import line_fit
+from hsnoise.fitting.maximise import maximise
+from hsnoise.fitting.notes import closing_notes, outlier_fraction
+from hsnoise.fitting.pixel_fit import measure
+from hsnoise.fitting.pixel_result import POPULATION, result_of
+from hsnoise.fitting.profile import profile_errors
+from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.fitting.simulated import fit_synthetic
+from hsnoise.frames.arguments import check_no_copies
+from hsnoise.frames.mosaics import warn_of_a_mosaic
+from hsnoise.frames.source import as_stack
+from hsnoise.likelihood.coordinates import coordinates_for, labels
+from hsnoise.likelihood.flat_gain import judged
+from hsnoise.likelihood.moments import start_physics
+from hsnoise.likelihood.physics import WITH_LIKELIHOOD, Physics, flat_gain_of
+from hsnoise.likelihood.summary import Summary, far_outliers, summarise
 from hsnoise.model import NoiseModel
-from hsnoise.moments import start_physics
-from hsnoise.notes import closing_notes, outlier_fraction
-from hsnoise.physics import WITH_LIKELIHOOD, Physics, flat_gain_of
-from hsnoise.pixel_fit import measure
-from hsnoise.pixel_result import POPULATION, result_of
-from hsnoise.pixels.structure import can_be_transferred, pixels_differ
-from hsnoise.pixels.survey import Survey, survey
-from hsnoise.profile import profile_errors
-from hsnoise.result import NOT_CONVERGED, FitResult
-from hsnoise.statistics import Summary, far_outliers, summarise
-from hsnoise.synthetic import fit_synthetic
+from hsnoise.simulation.draws import check_effects, check_fits, part_of
+from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ
+from hsnoise.statistics.pixels.survey import Survey, survey
 
 log = logging.getLogger(__name__)
 

@@ -19,17 +19,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from hsnoise import _html
-from hsnoise._arguments import checked_exposure, checked_light, listed, piece_of, whole_number
-from hsnoise._effect_json import effect_from_json, effect_to_json
-from hsnoise._keys import key_of, named_key
-from hsnoise._output import write_atomically
-from hsnoise._pandas import table_to_pandas
-from hsnoise._poisson import Regime, regime_of
-from hsnoise._types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
-from hsnoise.arrivals import merged
+from hsnoise._core import html as _html
+from hsnoise._core.arguments import listed, whole_number
+from hsnoise._core.data_frames import table_to_pandas
+from hsnoise._core.keys import key_of, named_key
+from hsnoise._core.output import write_atomically
+from hsnoise._core.poisson import Regime, regime_of
+from hsnoise._core.types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
+from hsnoise.chain.arguments import checked_exposure, checked_light, piece_of
+from hsnoise.chain.arrivals import merged
+from hsnoise.chain.effect_json import effect_from_json, effect_to_json
+from hsnoise.chain.signals import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
-from hsnoise.signal_chain import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 
 FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._arguments import listed, whole_number
-from hsnoise._keys import key_of
-from hsnoise._types import RandomKey
+from hsnoise._core.arguments import listed, whole_number
+from hsnoise._core.keys import key_of
+from hsnoise._core.types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 FORGET_BIAS = 1.0

@@ -10,7 +10,7 @@ from scipy import stats
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.arrivals import merged, slopes
+from hsnoise.chain.arrivals import merged, slopes
 from hsnoise.model import NoiseModel, sample, sample_dark
 
 KEY = jax.random.key(11)

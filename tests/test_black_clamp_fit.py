@@ -7,7 +7,7 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.draws import draw_capture
+from hsnoise.simulation.draws import draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)

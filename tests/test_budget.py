@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise._budget_table import concise
-from hsnoise.budget import NoiseBudget
-from hsnoise.decomposition import COMPONENTS
-from hsnoise.pixels import sample
+from hsnoise.criticism.budget import NoiseBudget
+from hsnoise.criticism.budget_table import concise
+from hsnoise.statistics.decomposition import COMPONENTS
+from hsnoise.statistics.pixels import sample
 
 SIGMA = {
     "frame": 3.0,

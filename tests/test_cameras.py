@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from hsnoise.cameras import canon_5d3, grasshopper3
 from hsnoise.effects import Gain
 from hsnoise.model import sample_dark
+from hsnoise.simulation.cameras import canon_5d3, grasshopper3
 
 TABLE_2 = {  # of the paper: row-gain variance, gain, dark current, read-noise variance
     canon_5d3: ((0.197, 0.039, 0.013), (1.53, 1.23, 1.31), 51.7, 12.5, 1.0, "rolling", 0.05),

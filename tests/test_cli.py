@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import _demo, _options, _output, criticism
-from hsnoise._loading import load_capture
-from hsnoise.cli import main
+from hsnoise import criticism
+from hsnoise._core import output as _output
+from hsnoise.cli import demo as _demo
+from hsnoise.cli import options as _options
+from hsnoise.cli.loading import load_capture
+from hsnoise.cli.main import main
 from hsnoise.criticism import Comparison, Step, Story
 
 COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample", "train", "evaluate")
@@ -319,5 +322,5 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
 def test_the_installed_command_is_main():
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"hsnoise": "hsnoise.cli:main"}
+    assert project["scripts"] == {"hsnoise": "hsnoise.cli.main:main"}
     assert project["version"] == hsnoise.__version__

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hsnoise import _counting
-from hsnoise._counting import Bins, count_rows
+from hsnoise.likelihood import counting as _counting
+from hsnoise.likelihood.counting import Bins, count_rows
 
 
 def expected(frame, bins, number):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.statistics import summarise
+from hsnoise.likelihood.summary import summarise
 
 da = pytest.importorskip("dask.array")
 distributed = pytest.importorskip("distributed")

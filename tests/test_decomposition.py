@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsnoise.decomposition import COMPONENTS, PlaneSums, _sums_of_squares
+from hsnoise.statistics.decomposition import COMPONENTS, PlaneSums, _sums_of_squares
 
 
 def summed(counts):

@@ -20,7 +20,7 @@ from skimage.data import astronaut, coffee
 from skimage.io import imsave
 
 import hsnoise
-from hsnoise.cli import main
+from hsnoise.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

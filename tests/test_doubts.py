@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.doubts import Evidence, checked
-from hsnoise.doubts._drawn import disagreements
 from hsnoise.fit import _surveyed
+from hsnoise.fitting.doubts._drawn import disagreements
+from hsnoise.fitting.doubts.checks import Evidence, checked
 
 EXPOSURES_S, FRAMES, SHAPE = (0.1, 0.4, 1.6), 6, (96, 128)
 GAIN, BLACK, READ_E = 2.0, 100.0, 4.0

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.cli import main
-from hsnoise.mosaic import mosaic
-from hsnoise.photometry import display_from_linear, frames_of_display
+from hsnoise.chain.photometry import display_from_linear, frames_of_display
+from hsnoise.cli.main import main
+from hsnoise.enhance.mosaic import mosaic
+from hsnoise.enhance.video import frames_of
+from hsnoise.enhance.weights import save_network
 from hsnoise.stlstm import STLSTM
-from hsnoise.video import frames_of
-from hsnoise.weights import save_network
 
 pytest.importorskip("av")
 FRAMES = np.random.default_rng(0).integers(0, 256, (3, 16, 24, 3), dtype=np.uint8)
@@ -45,7 +45,7 @@ def seen(monkeypatch):
         frames.extend(light)
         return iter(frames)
 
-    monkeypatch.setattr("hsnoise._enhance.enhance", keep)
+    monkeypatch.setattr("hsnoise.cli.enhance.enhance", keep)
     return frames
 
 
@@ -113,7 +113,7 @@ def test_nothing_is_left_of_a_run_that_is_terminated(place, monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
         yield next(light)
 
-    monkeypatch.setattr("hsnoise._enhance.enhance", ended)
+    monkeypatch.setattr("hsnoise.cli.enhance.enhance", ended)
     before, files = signal.signal(signal.SIGTERM, signal.SIG_IGN), set(place.iterdir())
     try:
         with pytest.raises(SystemExit, match="143"):

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import maximise as maximise_module
-from hsnoise import statistics
-from hsnoise._types import unit_in_words
+from hsnoise._core.types import unit_in_words
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise.fitting import maximise as maximise_module
+from hsnoise.fitting.notes import parameter_notes
+from hsnoise.likelihood import summary as statistics
+from hsnoise.likelihood.moments import start_physics
 from hsnoise.model import sample_dark
-from hsnoise.moments import start_physics
-from hsnoise.notes import parameter_notes
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 FRAMES, SHAPE = 4, (96, 128)

@@ -9,7 +9,7 @@ import pytest
 
 import hsnoise
 from benchmarks import simulator
-from hsnoise.moments import _of_one_rate
+from hsnoise.likelihood.moments import _of_one_rate
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 

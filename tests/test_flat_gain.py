@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hsnoise.flat_gain import flat_gain, local_gain
-from hsnoise.flats import FlatMoments
+from hsnoise.likelihood.flat_gain import flat_gain, local_gain
+from hsnoise.likelihood.flats import FlatMoments
 
 GAIN, READ_DN2, BLACK_DN, FULL_E, PIXELS, SEEDS = 0.42, 5.0, 100.0, 9000.0, 60_000, 60
 LIGHT_E = np.geomspace(60, FULL_E, 12)

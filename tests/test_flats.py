@@ -7,10 +7,10 @@ import pytest
 
 import hsnoise
 from hsnoise import FrameStack
-from hsnoise._types import StatedGain
-from hsnoise.flat_gain import flat_gain
-from hsnoise.flat_notes import gain_notes, stated_gain_note
-from hsnoise.flats import flat_moments
+from hsnoise._core.types import StatedGain
+from hsnoise.fitting.flat_notes import gain_notes, stated_gain_note
+from hsnoise.likelihood.flat_gain import flat_gain
+from hsnoise.likelihood.flats import flat_moments
 
 GAIN, READ_E, BLACK_DN, WHITE_DN, SHAPE = 0.5, 8.0, 200.0, 4095, (96, 128)
 FULL_E = (WHITE_DN - BLACK_DN) / GAIN

@@ -9,8 +9,8 @@ import pytest
 from astropy.io import fits
 
 import hsnoise
-from hsnoise.cli import main
-from hsnoise.stack import FrameStack
+from hsnoise.cli.main import main
+from hsnoise.frames.stack import FrameStack
 
 GAIN, READ_E, BLACK_DN, SHAPE = 2.0, 3.0, 200.0, (48, 96)
 RATE = np.random.default_rng(7).lognormal(np.log(20), 0.5, SHAPE)  # e-/s, pixels that differ

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import hsnoise
-from hsnoise._keys import LARGEST_SEED, key_of
+from hsnoise._core.keys import LARGEST_SEED, key_of
 from hsnoise.effects import RowFixedPattern
 from hsnoise.stlstm import STLSTM
 

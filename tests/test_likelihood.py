@@ -10,13 +10,13 @@ import pytest
 from scipy import stats
 
 import hsnoise
-from hsnoise import plan
-from hsnoise._compiling import _lean_options, jit_lean
+from hsnoise._core.compiling import _lean_options, jit_lean
+from hsnoise.likelihood import plan
+from hsnoise.likelihood.moments import start_physics
+from hsnoise.likelihood.physics import evaluate, physics_of
+from hsnoise.likelihood.plan import plan_rules
+from hsnoise.likelihood.summary import some_frames, summarise
 from hsnoise.model import sample_dark
-from hsnoise.moments import start_physics
-from hsnoise.physics import evaluate, physics_of
-from hsnoise.plan import plan_rules
-from hsnoise.statistics import some_frames, summarise
 
 EXPOSURE_S = (0.02, 0.1)
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise.cameras import canon_5d3, grasshopper3
-from hsnoise.line import line_fit
+from hsnoise.fitting.line import line_fit
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.summary import summarise
 from hsnoise.lut import clipped_moments, make_clip_tables, row_moments, unclip
 from hsnoise.model import sample, sample_dark
 from hsnoise.plots.clip_tables import clip_table_figure, clip_tables
-from hsnoise.stack import FrameStack
-from hsnoise.statistics import summarise
+from hsnoise.simulation.cameras import canon_5d3, grasshopper3
 
 EXPOSURES_S = (0.02, 0.05, 0.1, 0.2)
 

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise._keys import named_key
-from hsnoise._types import Scalar
-from hsnoise.cameras import canon_5d3
+from hsnoise._core.keys import named_key
+from hsnoise._core.types import Scalar
 from hsnoise.effects import (
     ADC,
     AbstractEffect,
@@ -28,8 +27,9 @@ from hsnoise.effects import (
     Stage,
     param,
 )
+from hsnoise.enhance.mosaic import electrons_of, mosaic
 from hsnoise.model import NoiseModel, sample, sample_dark
-from hsnoise.mosaic import electrons_of, mosaic
+from hsnoise.simulation.cameras import canon_5d3
 
 KEY = jax.random.key(19)
 P_VALUE = 1e-5

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise._types import BAYER_CFAS, cfa_tile
+from hsnoise._core.types import BAYER_CFAS, cfa_tile
+from hsnoise.chain.photometry import display_from_linear, linear_from_display
 from hsnoise.effects import BlackLevel, DarkCurrent, Gain
-from hsnoise.mosaic import electrons_of, mosaic
-from hsnoise.photometry import display_from_linear, linear_from_display
+from hsnoise.enhance.mosaic import electrons_of, mosaic
 
 LIGHT = np.random.default_rng(0).uniform(0, 5, (2, 4, 6, 3)).astype(np.float32)
 

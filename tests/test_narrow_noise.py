@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsnoise.narrow_noise import narrow_read_noise
+from hsnoise.statistics.narrow_noise import narrow_read_noise
 
 
 def darks(rng, sigma_dn, level_dn, spread_dn, frames=6):

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import _html
 from hsnoise import effects as fx
-from hsnoise._conclusion import Light
+from hsnoise._core import html as _html
+from hsnoise._core.conclusion import Light
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.finding import Unexplained
-from hsnoise.result import FitResult
+from hsnoise.fitting.result import FitResult
 
 NASTY = "<img src=x onerror=\"alert(1)\"> & 'quotes' </table></div>"
 MODEL = hsnoise.NoiseModel(

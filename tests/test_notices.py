@@ -10,8 +10,9 @@ import pytest
 import tifffile
 
 import hsnoise
-from hsnoise._arguments import check_no_copies, warn_of_a_mosaic
-from hsnoise.cli import main
+from hsnoise.cli.main import main
+from hsnoise.frames.arguments import check_no_copies
+from hsnoise.frames.mosaics import warn_of_a_mosaic
 
 
 def darks(exposure_s=0.2):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise._numerics import SADDLE_FROM, SADDLE_TO, bin_probability, distribution, poisson_normal_law
+from hsnoise.likelihood.poisson_normal import SADDLE_FROM, SADDLE_TO, bin_probability, distribution, poisson_normal_law
 
 
 def probabilities(mean_e, sigma_e, edges):

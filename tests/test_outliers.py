@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.statistics import far_outliers, summarise
+from hsnoise.likelihood.summary import far_outliers, summarise
 
 MODEL = hsnoise.cameras.grasshopper3(cfa="RGGB", black_level_dn=64)
 EXPOSURE_S = (0.05, 0.4)

@@ -109,7 +109,11 @@ def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
         names = set(file.namelist())
     package = {path.relative_to(ROOT).as_posix() for path in (ROOT / "hsnoise").rglob("*") if path.is_file()}
     package = {name for name in package if "__pycache__" not in name}
-    assert {"hsnoise/py.typed", "hsnoise/data/enhancer_canon_5d3.eqx", "hsnoise/data/st8/README.txt"} <= package
+    assert {
+        "hsnoise/py.typed",
+        "hsnoise/enhance/data/enhancer_canon_5d3.eqx",
+        "hsnoise/frames/data/st8/README.txt",
+    } <= package
     assert len([name for name in package if name.endswith(".fits.fz")]) == 18
     about = f"hsnoise-{PROJECT['version']}.dist-info/"
     assert {name for name in names if not name.startswith(about)} == package
@@ -121,7 +125,7 @@ def test_the_wheel_says_what_it_is(wheel):
     with zipfile.ZipFile(wheel) as file:
         about = f"hsnoise-{PROJECT['version']}.dist-info"
         metadata = Parser().parsestr(file.read(f"{about}/METADATA").decode())
-        assert "hsnoise = hsnoise.cli:main" in file.read(f"{about}/entry_points.txt").decode()
+        assert "hsnoise = hsnoise.cli.main:main" in file.read(f"{about}/entry_points.txt").decode()
     assert metadata["License-Expression"] == "Apache-2.0"
     assert not [one for one in metadata.get_all("Classifier") if one.startswith("License")]  # the expression says it
     assert "Typing :: Typed" in metadata.get_all("Classifier")
@@ -144,7 +148,7 @@ def test_the_installed_package_works_outside_of_the_checkout(installed, tmp_path
     code = """
 from pathlib import Path
 import hsnoise
-from hsnoise.weights import SHIPPED, load_network
+from hsnoise.enhance.weights import SHIPPED, load_network
 folder = Path(hsnoise.__file__).parent
 assert (folder / "py.typed").exists() and load_network(SHIPPED)
 print(folder, hsnoise.__version__)

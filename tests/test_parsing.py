@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from hsnoise._options import parser
-from hsnoise._parsing import seconds
-from hsnoise.cli import main
+from hsnoise._core.parsing import seconds
+from hsnoise.cli.main import main
+from hsnoise.cli.options import parser
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from hsnoise.photometry import photoelectrons_from_illuminance, scale_to_photoelectrons
+from hsnoise.chain.photometry import photoelectrons_from_illuminance, scale_to_photoelectrons
 
 
 def test_equation_9_by_hand():

@@ -11,9 +11,9 @@ import pytest
 
 import hsnoise
 from benchmarks.pixel_simulator import DETERMINED, UNDETERMINED, draw
-from hsnoise._types import StatedGain
+from hsnoise._core.types import StatedGain
 from hsnoise.effects import ADC, BlackLevel, Gain, HotPixels, ReadNoise, ShotNoise
-from hsnoise.pixels.clipping import clipped_moments, unclipped
+from hsnoise.statistics.pixels.clipping import clipped_moments, unclipped
 
 KNOWN = ("exposure_s", "black_level", "white_level", "cfa", "shutter")
 

@@ -15,13 +15,13 @@ import pytest
 
 import hsnoise
 from hsnoise import plots
-from hsnoise.physics import physics_of
+from hsnoise.likelihood.physics import physics_of
+from hsnoise.likelihood.summary import summarise
 from hsnoise.plots._histograms import _coarse
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._photon_transfer import clipped_fraction
 from hsnoise.plots._row_spectrum import _bands
 from hsnoise.plots._style import new_figure
-from hsnoise.statistics import summarise
 
 EXPOSURES_S = (0.1, 0.4)
 GAIN, RATE, READ, SIGMA = 1.5, 60.0, 3.0, 0.2

@@ -13,10 +13,10 @@ import pytest
 
 import hsnoise
 from hsnoise import plots
-from hsnoise.pixels.flags import FLAGS
-from hsnoise.pixels.maps import PixelMaps
 from hsnoise.plots._pixel_transfer import signal_of, transfers_of
 from hsnoise.plots._sampled import edges_of
+from hsnoise.statistics.pixels.flags import FLAGS
+from hsnoise.statistics.pixels.maps import PixelMaps
 
 TIMES, FRAMES, SHAPE = (0.0, 4.0), 6, (96, 128)
 GAIN, RATE = 2.0, 60.0

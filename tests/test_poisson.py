@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise._poisson import normal_of_bits, pixel_words, poisson_of_bits
+from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits
 
 CELLS = 2**23
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hsnoise.pixels.population import _fitted, growth_cdf
+from hsnoise.statistics.pixels.population import _fitted, growth_cdf
 
 TRUTHS = [(30.0, 0.4, 0.005, 180.0), (20.0, 0.2, 0.02, 100.0), (5.0, 0.6, 0.0, 1.0)]
 NOISES = [0.8, 4.0, 15.0]  # far narrower than the population, about as wide, wider

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from hsnoise import _progress
-from hsnoise._progress import Account, busy
+from hsnoise.cli import progress as _progress
+from hsnoise.cli.progress import Account, busy
 
 
 class Clock:

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import _demo, criticism, plots, report
+from hsnoise import criticism, plots, report
 from hsnoise import effects as fx
-from hsnoise.cli import main
+from hsnoise.cli import demo as _demo
+from hsnoise.cli.main import main
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.diagnose import Unexplained
 from hsnoise.criticism.improve import UNFINISHED
-from hsnoise.draws import draw_capture
+from hsnoise.fitting.result import NOT_CONVERGED, FitResult
 from hsnoise.plots._groups import family_of, parts_of
 from hsnoise.report import _context, _figures, _measured, _pictures
-from hsnoise.result import NOT_CONVERGED, FitResult
+from hsnoise.simulation.draws import draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 PLAIN = MODEL.remove("row_gain")  # its likelihood takes less time

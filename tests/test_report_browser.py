@@ -14,9 +14,9 @@ from hsnoise import report
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.diagnose import Unexplained
 from hsnoise.criticism.improve import UNFINISHED
-from hsnoise.draws import draw_capture
+from hsnoise.fitting.result import FitResult
 from hsnoise.plots._groups import FAMILIES
-from hsnoise.result import FitResult
+from hsnoise.simulation.draws import draw_capture
 
 pytestmark = pytest.mark.browser
 

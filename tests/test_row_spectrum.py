@@ -146,7 +146,7 @@ def test_a_share_of_one_is_a_global_shutter():
 
 
 def test_a_large_capture_finds_the_share_by_its_pilot(mixture, monkeypatch):
-    from hsnoise import maximise
+    from hsnoise.fitting import maximise
 
     model, stack, free, _ = mixture
     monkeypatch.setattr(maximise, "MANY_ROWS", 1000)

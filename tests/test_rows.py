@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from hsnoise import rows
+from hsnoise.likelihood import rows
 
 
 def nodes_over(low, high, scale, sigma, count):

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import pytest
 
-from hsnoise.cameras import canon_5d3
 from hsnoise.effects import ColumnNoise, RowNoise, SharedRowGain
 from hsnoise.model import sample
+from hsnoise.simulation.cameras import canon_5d3
 
 PROGRAM = """
 import hashlib, json, sys

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise._source import as_stack
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.stack import FrameStack
+from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
 
 MODEL = hsnoise.NoiseModel(
     [ShotNoise(), DarkCurrent(400.0), ReadNoise(3.0), Gain(2.0), BlackLevel(100.0), ADC()],

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsnoise._frames import LazyFrames
-from hsnoise._reading import check_frame
-from hsnoise._source import as_stack
-from hsnoise.stack import FrameStack
+from hsnoise.frames.lazy import LazyFrames
+from hsnoise.frames.reading import check_frame
+from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsnoise._frames import LazyFrames, shift_cfa, transpose_cfa
-from hsnoise._types import StatedGain
-from hsnoise.stack import FrameStack
+from hsnoise._core.types import StatedGain
+from hsnoise.frames.bayer import shift_cfa, transpose_cfa
+from hsnoise.frames.lazy import LazyFrames
+from hsnoise.frames.stack import FrameStack
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis.extra.numpy import arrays
 
-from hsnoise import statistics
-from hsnoise._frames import LazyFrames, channel_rows
-from hsnoise._types import BAYER_CFAS
-from hsnoise.stack import FrameStack
-from hsnoise.statistics import (
+from hsnoise._core.types import BAYER_CFAS
+from hsnoise.frames.bayer import channel_rows
+from hsnoise.frames.lazy import LazyFrames
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood import summary as statistics
+from hsnoise.likelihood.summary import (
     MOST_BINS,
     every_nth_row,
     round_up,

@@ -37,7 +37,8 @@ from hsnoise.effects import (
     TapOffsets,
 )
 from hsnoise.model import NoiseModel
-from hsnoise.structure import _anova, code_step, moving_line, places, structure
+from hsnoise.statistics import _anova
+from hsnoise.statistics.structure import code_step, moving_line, places, structure
 
 SHAPE, FRAMES, EXPOSURE_S = (96, 128), 6, (0.01, 0.03, 0.1, 0.2)
 CLEAN = 12

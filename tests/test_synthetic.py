@@ -8,9 +8,9 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.covariances import as_scattered, not_surer_than
 from hsnoise.effects import RowNoise
-from hsnoise.synthetic import (
+from hsnoise.fitting.covariances import as_scattered, not_surer_than
+from hsnoise.fitting.simulated import (
     LAST_DRAWS,
     MOST_ITERATIONS,
     SHORT_STEP,

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import cli, criticism
-from hsnoise._conclusion import Conclusion, Light
-from hsnoise._telling import Page, in_options, tell
-from hsnoise.cli import main
+from hsnoise import criticism
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise.cli import main as cli
+from hsnoise.cli.main import main
+from hsnoise.cli.telling import Page, in_options, tell
 from hsnoise.criticism import Candidate, Diagnosis, Step, Story
 from hsnoise.criticism.finding import Unexplained
 

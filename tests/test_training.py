@@ -13,16 +13,16 @@ import hsnoise
 from benchmarks import noise_ablation
 from benchmarks.evaluate import main as run_evaluate
 from benchmarks.train import main as run_train
+from hsnoise.chain.photometry import display_from_linear
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
-from hsnoise.mosaic import electrons_of
-from hsnoise.photometry import display_from_linear
-from hsnoise.training import checkpoints, evaluate, train
-from hsnoise.training.clips import Clip, crops, held_out, read_clips
-from hsnoise.training.noisy import Camera, camera_of
-from hsnoise.training.presets import Preset, Recipe
-from hsnoise.training.rivals import denoised, rivals, tuned
-from hsnoise.training.steps import Trainer, batch_rng
-from hsnoise.weights import load_network, save_network
+from hsnoise.enhance.mosaic import electrons_of
+from hsnoise.enhance.training import checkpoints, evaluate, train
+from hsnoise.enhance.training.clips import Clip, crops, held_out, read_clips
+from hsnoise.enhance.training.noisy import Camera, camera_of
+from hsnoise.enhance.training.presets import Preset, Recipe
+from hsnoise.enhance.training.rivals import denoised, rivals, tuned
+from hsnoise.enhance.training.steps import Trainer, batch_rng
+from hsnoise.enhance.weights import load_network, save_network
 
 TINY = Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
 
@@ -82,7 +82,7 @@ def test_a_full_disk_is_told_and_the_last_checkpoint_stays(folder, tmp_path, mon
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hsnoise.training.checkpoints.write_arrays", full)
+    monkeypatch.setattr("hsnoise.enhance.training.checkpoints.write_arrays", full)
     with pytest.raises(OSError, match="the last one is intact"):
         checkpoints.write(tmp_path / "run", 7, {}, {})
     assert [path.read_bytes() for path in checkpoints.checkpoints(tmp_path / "run")] == kept
@@ -241,7 +241,7 @@ def test_the_same_step_is_the_same_whatever_came_before(folder):
 
 
 def test_rivals_that_are_not_installed_are_named_with_their_extra(monkeypatch, capsys):
-    monkeypatch.setattr("hsnoise.training.rivals.find_spec", lambda name: None)
+    monkeypatch.setattr("hsnoise.enhance.training.rivals.find_spec", lambda name: None)
     monkeypatch.setattr(evaluate, "rivals", dict)  # the others take minutes
     evaluate.methods_of(None, None, untrained=True)
     assert "BM3D and BM4D over frames are left out: pip install 'hsnoise[peers]'" in capsys.readouterr().out

@@ -12,14 +12,14 @@ from PIL import Image
 from scipy import ndimage
 
 import hsnoise
-from hsnoise._types import cfa_tile
+from hsnoise._core.types import cfa_tile
 from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise, TapOffsets
-from hsnoise.training import evaluate
-from hsnoise.training.clips import Clip, crops, held_out, moving_stills, read_clips
-from hsnoise.training.noisy import OPTICS, camera_of, jittered, matched, noise_of
-from hsnoise.training.steps import batch_rng, examples
-from hsnoise.training.validation import Validation
-from hsnoise.training.vgg import LAYERS, features_of, name_of, read_weights
+from hsnoise.enhance.training import evaluate
+from hsnoise.enhance.training.clips import Clip, crops, held_out, moving_stills, read_clips
+from hsnoise.enhance.training.noisy import OPTICS, camera_of, jittered, matched, noise_of
+from hsnoise.enhance.training.steps import batch_rng, examples
+from hsnoise.enhance.training.validation import Validation
+from hsnoise.enhance.training.vgg import LAYERS, features_of, name_of, read_weights
 
 
 def test_a_short_clip_is_played_forth_and_back():

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from hsnoise.video import frame_rate_of, frames_of, is_clip, write_video
+from hsnoise.enhance.video import frame_rate_of, frames_of, is_clip, write_video
 
 FRAMES = np.stack([np.full((32, 48, 3), 40 * i, np.uint8) for i in range(5)])
 

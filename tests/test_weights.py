@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
+from hsnoise.enhance.weights import SHIPPED, load_network, read_arrays, save_network, write_arrays
 from hsnoise.stlstm import STLSTM
-from hsnoise.weights import SHIPPED, load_network, read_arrays, save_network, write_arrays
 
 NET = STLSTM(jax.random.key(0), maps=2, kernels=(3, 5), stride=2, channels=1)
 

@@ -1,4 +1,7 @@
-"""Does the model describe the sensor, and if not, which effect is missing: compare, diagnose, improve."""
+"""Does the model describe the sensor, and if not, which effect is missing: compare, diagnose, improve; budget, inspect.
+
+May import all but `report` and the command line.
+"""
 
 from __future__ import annotations
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise import effects as fx
-from hsnoise.draws import black_level_of, draw_capture, light_of
 from hsnoise.effects import AbstractEffect
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
-from hsnoise.structure import Places, code_step, moving_line, places
+from hsnoise.simulation.draws import black_level_of, draw_capture, light_of
+from hsnoise.statistics.structure import Places, code_step, moving_line, places
 
 LEAST_ELECTRONS = 0.2
 LEVELS_OF_A_CURVE = 3  # a straight line goes through any two

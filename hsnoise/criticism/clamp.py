@@ -12,7 +12,7 @@ from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
 from hsnoise.fit import fit, without_likelihood
-from hsnoise.result import FitResult
+from hsnoise.fitting.result import FitResult
 
 CLAMP = BlackClamp.name
 DRAWS = 40

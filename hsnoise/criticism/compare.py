@@ -10,19 +10,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise import _html
-from hsnoise._arguments import callback, seed_of, whole_number
-from hsnoise._conclusion import Conclusion, Light
-from hsnoise._pandas import data_frame
-from hsnoise._source import as_stack
-from hsnoise._threads import in_threads
+from hsnoise._core import html as _html
+from hsnoise._core.arguments import callback, seed_of, whole_number
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.data_frames import data_frame
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism.reference import measure, misfits, reference
-from hsnoise.draws import check_effects, check_fits, darks_of, part_of
-from hsnoise.likelihood import log_likelihood
+from hsnoise.fitting.result import number
+from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.joint import log_likelihood
 from hsnoise.model import NoiseModel
-from hsnoise.result import number
-from hsnoise.stack import FrameStack
-from hsnoise.structure import explained
+from hsnoise.simulation.draws import check_effects, check_fits, darks_of, part_of
+from hsnoise.statistics.structure import explained
 
 DRAWS = 40
 WORST = 5  # statistics told in words

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise._arguments import callback, listed, seed_of, whole_number
-from hsnoise._source import as_stack
+from hsnoise._core.arguments import callback, listed, seed_of, whole_number
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
@@ -38,10 +37,11 @@ from hsnoise.criticism.ranking import (
 )
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined, refined_pair, with_base
-from hsnoise.draws import check_effects, check_fits, part_of
 from hsnoise.effects import AbstractEffect
+from hsnoise.fitting.result import FitResult
+from hsnoise.frames.source import as_stack
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult
+from hsnoise.simulation.draws import check_effects, check_fits, part_of
 
 log = logging.getLogger(__name__)
 

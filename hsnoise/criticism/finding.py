@@ -10,10 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise import _html
-from hsnoise._conclusion import Conclusion, Light
-from hsnoise._pandas import data_frame
-from hsnoise._types import unit_in_words
+from hsnoise._core import html as _html
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.data_frames import data_frame
+from hsnoise._core.types import unit_in_words
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hsnoise._threads import in_threads
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism.candidates import Maker, made
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.reference import Reference, measure
-from hsnoise.draws import draw_capture
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
+from hsnoise.simulation.draws import draw_capture
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
 SLOPE_DRAWS = 3

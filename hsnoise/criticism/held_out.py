@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hsnoise.criticism.reference import measure, reference
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
 DRAWS, SEEDS = 40, 5000  # of the likelihood; where its seeds begin, beyond those of fits

@@ -10,22 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise._arguments import callback, counter, seed_of, whole_number
-from hsnoise._source import as_stack
-from hsnoise._types import unit_in_words
+from hsnoise._core.arguments import callback, counter, seed_of, whole_number
+from hsnoise._core.types import unit_in_words
 from hsnoise.criticism.compare import DRAWS, Comparison, compare
 from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import CHANCE_ERROR, FINISHED, Step, Story
-from hsnoise.draws import check_effects, check_fits, darks_of
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import fit, rechecked
+from hsnoise.fitting.result import FitResult, number, rounded
+from hsnoise.fitting.simulated import fit_synthetic
+from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 from hsnoise.model import NoiseModel
-from hsnoise.physics import WITH_LIKELIHOOD
-from hsnoise.result import FitResult, number, rounded
-from hsnoise.stack import FrameStack
-from hsnoise.synthetic import fit_synthetic
+from hsnoise.simulation.draws import check_effects, check_fits, darks_of
 
 log = logging.getLogger(__name__)
 

@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from hsnoise._threads import in_threads
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.draws import black_level_of, draw_capture, floored_variance
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
-from hsnoise.structure import Structure, structure
+from hsnoise.simulation.draws import black_level_of, draw_capture, floored_variance
+from hsnoise.statistics.structure import Structure, structure
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from functools import reduce
 
 import numpy as np
 
-from hsnoise._threads import in_threads
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, law_of
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Evidence, Pair
-from hsnoise.draws import share_of_far
 from hsnoise.effects import AbstractEffect
-from hsnoise.knobs import Knob, knobs
+from hsnoise.fitting.knobs import Knob, knobs
 from hsnoise.model import NoiseModel
+from hsnoise.simulation.draws import share_of_far
 
 ITERATIONS = 3
 DRAWS, SLOPE_DRAWS, PAIR_DRAWS = 6, 3, 12

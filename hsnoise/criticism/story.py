@@ -11,15 +11,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hsnoise import _html
-from hsnoise._conclusion import Conclusion, Light
-from hsnoise._pandas import data_frame
-from hsnoise._types import unit_in_words
+from hsnoise._core import html as _html
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.data_frames import data_frame
+from hsnoise._core.types import unit_in_words
 from hsnoise.criticism.compare import CLOSE, FITS, Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
 from hsnoise.fit import without_likelihood
+from hsnoise.fitting.result import FitResult, number, rounded
 from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult, number, rounded
 
 CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
 SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is

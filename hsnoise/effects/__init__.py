@@ -1,4 +1,7 @@
-"""Physical effects, one a file, and the one list of those built in."""
+"""Physical effects, one a file, and the one list of those built in.
+
+May import `_core` alone; two effects never see each other.
+"""
 
 from __future__ import annotations
 

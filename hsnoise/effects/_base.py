@@ -25,9 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._keys import named_key
-from hsnoise._poisson import normal_of_bits, pixel_words, poisson_of_bits
-from hsnoise._types import (
+from hsnoise._core.keys import named_key
+from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits
+from hsnoise._core.types import (
     Counts,
     FrameRows,
     Frames,

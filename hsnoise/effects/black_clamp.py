@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from hsnoise._types import Frames, PerChannel, RandomKey
+from hsnoise._core.types import Frames, PerChannel, RandomKey
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 

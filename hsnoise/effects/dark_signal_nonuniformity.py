@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 
-from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 

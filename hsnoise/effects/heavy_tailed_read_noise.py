@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammainc, gammaincc, gammaln
 
-from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 LARGEST_LOGIT = 22.9  # of a uniform number of 32 bits

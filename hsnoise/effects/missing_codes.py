@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._types import Counts, Frames, RandomKey, Scalar
+from hsnoise._core.types import Counts, Frames, RandomKey, Scalar
 from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage, param
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, normal_of_pixels, param
 
 

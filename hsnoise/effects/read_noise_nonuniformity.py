@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from hsnoise._types import Frames, PixelMap, RandomKey, Scalar
+from hsnoise._core.types import Frames, PixelMap, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from hsnoise._coloured import coloured_normal, row_gain_power
-from hsnoise._types import Frames, RandomKey, Scalar
+from hsnoise._core.coloured import coloured_normal, row_gain_power
+from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
 
 

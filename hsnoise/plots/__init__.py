@@ -1,4 +1,7 @@
-"""Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot."""
+"""Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot.
+
+May import fits and what they may; imported only when a figure is drawn.
+"""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hsnoise._types import seconds
-from hsnoise.decomposition import COMPONENTS
+from hsnoise._core.types import seconds
 from hsnoise.plots._style import FIT, NAMES, new_figure, tidy
+from hsnoise.statistics.decomposition import COMPONENTS
 
 ORDER = ("temporal", "row_x_frame", "column_x_frame", "frame", "pixel", "column", "row")  # changing, then static
 LABELS = {name: name.replace("_x_", " x ") for name in COMPONENTS}

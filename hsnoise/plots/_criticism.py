@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MultipleLocator, NullLocator
 
+from hsnoise.fitting.result import number
 from hsnoise.plots._groups import COLOUR_OF, INK, PLACE, WORDS, Part, parts_of
 from hsnoise.plots._style import COLOURS, FIT, new_figure, tidy
-from hsnoise.result import number
 
 MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]

@@ -7,10 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from hsnoise._types import seconds
+from hsnoise._core.types import seconds
+from hsnoise.likelihood.summary import RowHistograms
 from hsnoise.plots._sampled import sampled_histograms
 from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy, title_of
-from hsnoise.statistics import RowHistograms
 
 MOST_BINS = 90  # that can be told apart in a panel
 ENOUGH = 10.0  # expected counts from which on a residual is shown

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hsnoise.likelihood.physics import Physics, black_level_at
 from hsnoise.lut import clipped_moments
-from hsnoise.physics import Physics, black_level_at
 
 BETA_NODES = 32
 LEAST_BETA = 1e-6

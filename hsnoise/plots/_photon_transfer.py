@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.flat_gain import FlatGain, local_gain, variance_curve
-from hsnoise.flat_likelihood import ROUNDING_VARIANCE
-from hsnoise.moments import binned_moments
-from hsnoise.physics import Physics, black_level_at, flat_gain_of
+from hsnoise.likelihood.flat_gain import FlatGain, local_gain, variance_curve
+from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
+from hsnoise.likelihood.moments import binned_moments
+from hsnoise.likelihood.physics import Physics, black_level_at, flat_gain_of
+from hsnoise.likelihood.summary import RowHistograms, Summary, far_outliers
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, plain_log, tidy, title_of
-from hsnoise.statistics import RowHistograms, Summary, far_outliers
 
 CLIPPED_FRACTION = 1e-3
 CURVE_POINTS = 40

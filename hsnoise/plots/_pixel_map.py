@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.pixels.flags import FLAGS
 from hsnoise.plots._style import new_figure, tidy
+from hsnoise.statistics.pixels.flags import FLAGS
 
 MOST_DOTS = 1500  # of a kind, beyond which a density is drawn
 BLOCKS = 96  # along the longer side of a density

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.pixels.classes import slope_over
-from hsnoise.pixels.transfer import Transfer
+from hsnoise.fitting.result import rounded
 from hsnoise.plots._style import COLOURS, FIT, HOT, NAMES, bend_axis, new_figure, plain_log, tidy
-from hsnoise.result import rounded
+from hsnoise.statistics.pixels.classes import slope_over
+from hsnoise.statistics.pixels.transfer import Transfer
 
 CURVE_POINTS = 200
 FAR = 1.25  # times the largest signal: the end of the axis

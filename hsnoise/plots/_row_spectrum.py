@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise import rows
-from hsnoise._types import seconds
-from hsnoise.physics import Physics
+from hsnoise._core.types import seconds
+from hsnoise.likelihood import rows
+from hsnoise.likelihood.physics import Physics
+from hsnoise.likelihood.summary import RowHistograms, Summary
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import transfers_of
 from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy, title_of
-from hsnoise.statistics import RowHistograms, Summary
 
 BANDS_PER_OCTAVE = 3
 SHOWN_IN_DARKS = 1e-3  # row gain that flats may know, but no dark shows, is below

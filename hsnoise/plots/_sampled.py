@@ -7,12 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from hsnoise._types import cfa_tile, seconds
-from hsnoise.draws import draw_capture, middle_of
-from hsnoise.pixels.classes import growth_noise, levels_of, slope_over
-from hsnoise.pixels.survey import survey
+from hsnoise._core.types import cfa_tile, seconds
+from hsnoise.frames.stack import FrameStack
 from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
-from hsnoise.stack import FrameStack
+from hsnoise.simulation.draws import draw_capture, middle_of
+from hsnoise.statistics.pixels.classes import growth_noise, levels_of, slope_over
+from hsnoise.statistics.pixels.survey import survey
 
 CORE = (5e-4, 0.97)  # quantiles between which bins are equally wide
 CORE_BINS, WIDER = 60, 1.25  # bins of the core; how much wider each beyond is

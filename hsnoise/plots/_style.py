@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from hsnoise.fit import without_likelihood
-from hsnoise.result import FitResult
+from hsnoise.fitting.result import FitResult
 
 # Okabe and Ito's palette: told apart with any colour vision; the markers tell channels apart without colour.
 COLOURS = {"R": "#D55E00", "G": "#009E73", "B": "#0072B2", "mono": "#404040"}

@@ -1,80 +1,8 @@
-"""One page of HTML about a capture and a model: what `fit`, `compare`, `diagnose` or `improve` found, with figures.
+"""One page of HTML about a capture and what was found in it.
 
-The page holds its figures and styles, asks no network for anything, and is written whole or not at all.
+May import all but the command line.
 """
 
-from __future__ import annotations
+from hsnoise.report.page import Found, check_path, page, write_report
 
-import os
-from collections.abc import Sequence
-from pathlib import Path
-
-from hsnoise._output import write_atomically
-from hsnoise.criticism import Comparison, Diagnosis, Story
-from hsnoise.model import NoiseModel
-from hsnoise.result import FitResult
-from hsnoise.stack import FrameStack
-
-Found = Comparison | Diagnosis | Story | FitResult
-
-__all__ = ["check_path", "page", "write_report"]
-
-
-def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None) -> None:
-    """Raise ValueError unless a page can be written to `path`; call before long work.
-
-    Args:
-        path: ends in .html, in a folder that exists.
-        made: a folder that may not exist yet, because the caller makes it.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".html":
-        raise ValueError(f"report: expected a file ending in .html, got {path}")
-    if path.is_dir():
-        raise ValueError(f"report: expected a file, but {path} is a folder")
-    if not path.parent.is_dir() and (made is None or path.parent.resolve() != Path(made).resolve()):
-        raise ValueError(f"report: there is no folder {path.parent}")
-
-
-def page(
-    found: Found,
-    stack: FrameStack,
-    *,
-    fit: FitResult | NoiseModel | None = None,
-    comparison: Comparison | None = None,
-    files: Sequence[str] = (),
-    seed: int = 0,
-) -> str:
-    """The page as text.
-
-    Args:
-        found: result of `hsnoise.compare`, `diagnose`, `improve` or `fit`.
-        stack: the capture that it is about; its dark frames are shown beside draws of the model.
-        fit: the model that was compared or diagnosed, with standard errors if it is a FitResult; not for a Story
-            or a fit, which have their own.
-        comparison: of that model, for a Diagnosis: its bars and worst statistics are left out without.
-        files: names of the files that the capture was read from.
-        seed: of the draws that are shown.
-
-    Raises:
-        TypeError, ValueError: no fit with a Comparison or Diagnosis, or one that does not fit the stack; no darks.
-    """
-    from hsnoise.report._context import context  # Jinja2 and matplotlib are slow to import
-    from hsnoise.report._figures import render
-
-    if isinstance(found, Story | FitResult):
-        fit = found.fit if isinstance(found, Story) else found
-    if not isinstance(fit, FitResult | NoiseModel):
-        raise TypeError(f"fit: expected a FitResult or a NoiseModel, got {type(fit).__name__}")
-    return render(context(found, stack, fit, comparison, files, seed), found, stack, fit, seed)
-
-
-def write_report(path: str | os.PathLike, found: Found, stack: FrameStack, **keywords) -> None:
-    """Write the page of `page(found, stack, **keywords)` to a file.
-
-    Raises:
-        ValueError: a path that `check_path` refuses; TypeError, ValueError: see `page`.
-        OSError: the file cannot be written; one that exists is left as it was.
-    """
-    check_path(path)
-    write_atomically(path, page(found, stack, **keywords).encode())
+__all__ = ["Found", "check_path", "page", "write_report"]

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise._conclusion import Conclusion, Light
-from hsnoise._types import unit_in_words
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.compare import FITS, nearer
 from hsnoise.criticism.improve import UNFINISHED
 from hsnoise.criticism.story import together
+from hsnoise.fitting.result import FitResult, number, rounded
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.plots._groups import COLOUR_OF, INK, PLACE, WORDS, Part, family_of, parts_of
-from hsnoise.result import FitResult, number, rounded
-from hsnoise.stack import FrameStack
-from hsnoise.structure import explained
+from hsnoise.statistics.structure import explained
 
 ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars

@@ -15,18 +15,18 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from hsnoise._types import seconds
-from hsnoise.budget import BudgetRow
+from hsnoise._core.types import seconds
 from hsnoise.criticism import Comparison, Diagnosis, Story
+from hsnoise.criticism.budget import BudgetRow
+from hsnoise.fitting.result import FitResult
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.plots._budget import CLEAR, LABELS, ORDER, SHADES
 from hsnoise.plots._style import NAMES, new_figure, plain_log, tidy
 from hsnoise.report import _measured
 from hsnoise.report._measured import Middle, Shown
 from hsnoise.report._pictures import pictures
-from hsnoise.result import FitResult
-from hsnoise.stack import FrameStack
-from hsnoise.structure import SHORT
+from hsnoise.statistics.structure import SHORT
 
 SIZE_IN = (4.4, 3.1)  # of a panel: its letters can be read at the width of a phone
 LINES = ("row", "column")

@@ -8,12 +8,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from hsnoise._frames import channel_pixels, channel_planes
-from hsnoise._threads import in_threads
-from hsnoise.budget import NoiseBudget, budget
-from hsnoise.draws import check_fits, darks_of, draw_capture, middle_of
+from hsnoise._core.threads import in_threads
+from hsnoise.criticism.budget import NoiseBudget, budget
+from hsnoise.frames.bayer import channel_pixels, channel_planes
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.stack import FrameStack
+from hsnoise.simulation.draws import check_fits, darks_of, draw_capture, middle_of
 
 DRAWS = 4
 SEED_APART = 9000  # the draws shown are none of those that the comparison was made with

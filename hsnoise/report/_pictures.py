@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
-from hsnoise._types import cfa_tile
+from hsnoise._core.types import cfa_tile
 
 STRETCH = (0.5, 99.5)  # percentiles of the measured frame that are black and white
 REACH = 1.1  # of the largest mean of a line, at the ends of the strips

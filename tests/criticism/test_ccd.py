@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.synthetic import Problem
+from hsnoise.fitting.simulated import Problem
 
 FRAMES, SHAPE, GAIN, BLACK_DN = 8, (200, 256), 1.8, 150
 

@@ -10,8 +10,8 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.criticism.candidates import built_in
 from hsnoise.criticism.reference import measure
-from hsnoise.draws import draw_capture, light_of, part_of
-from hsnoise.stack import FrameStack
+from hsnoise.frames.stack import FrameStack
+from hsnoise.simulation.draws import draw_capture, light_of, part_of
 
 CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
 SHAPE, FRAMES = (64, 96), 8

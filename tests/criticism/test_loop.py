@@ -14,14 +14,14 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise._demo import simulated
+from hsnoise.cli.demo import simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
 from hsnoise.criticism.improve import _is_there, _is_too_little, _left_out, _why_worse, _Work
 from hsnoise.criticism.story import Step, together
-from hsnoise.draws import darks_of, draw_capture
+from hsnoise.simulation.draws import darks_of, draw_capture
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)

@@ -12,8 +12,8 @@ from hsnoise.criticism.gaussian import shrunk
 from hsnoise.criticism.ranking import Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined
-from hsnoise.draws import draw_capture
-from hsnoise.stack import FrameStack
+from hsnoise.frames.stack import FrameStack
+from hsnoise.simulation.draws import draw_capture
 
 CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.05, 0.1, 0.2)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise import rows as rows_module
 from hsnoise.effects import RowGain
+from hsnoise.likelihood import rows as rows_module
 from hsnoise.model import NoiseModel, sample
 
 KEY = jax.random.key(13)

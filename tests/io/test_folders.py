@@ -7,8 +7,8 @@ import pytest
 import tifffile
 from astropy.io import fits
 
-from hsnoise.io import load
-from hsnoise.io._kinds import exposure_of_names, kind_of
+from hsnoise.frames.io._kinds import exposure_of_names, kind_of
+from hsnoise.frames.io.load import load
 
 DARK_DN, FLAT_DN = 500, 4000
 

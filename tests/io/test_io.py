@@ -9,7 +9,7 @@ import pytest
 import tifffile
 from astropy.io import fits
 
-from hsnoise.io import load
+from hsnoise.frames.io.load import load
 
 
 def dark_counts(*shape, mean=100, seed=0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from hsnoise.io import load
+from hsnoise.frames.io.load import load
 
 BLACK_DN, WIDTH = 500, 12
 

@@ -8,11 +8,11 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hsnoise._frames import LazyFrames
-from hsnoise.io import load
-from hsnoise.io._files import paths_of
-from hsnoise.io._grouping import group_by_exposure
-from hsnoise.io._recording import Recording
+from hsnoise.frames.io._files import paths_of
+from hsnoise.frames.io._grouping import group_by_exposure
+from hsnoise.frames.io._recording import Recording
+from hsnoise.frames.io.load import load
+from hsnoise.frames.lazy import LazyFrames
 
 
 def dark_counts(*shape):

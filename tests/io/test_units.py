@@ -11,7 +11,7 @@ import tifffile
 from astropy.io import fits
 
 import hsnoise
-from hsnoise._output import frames_file
+from hsnoise._core.output import frames_file
 
 EXPOSURE, ISO, RATIONAL, SHORT = 33434, 34855, 5, 3
 

@@ -1,0 +1,46 @@
+"""Coloured series: their power spectra, which the draws and the likelihood share, and the draws themselves.
+
+A spectrum is the mean power of the n periodogram bins of a series of n, in units of its variance where that is 1: the
+bins' mean is 1, and white noise has 1 in each. Bin k holds min(k, n - k) cycles per series.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hsnoise._core.types import RandomKey, Scalar
+
+
+def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
+    """Spectrum [n] of power k^-exponent at k = 1 ... n/2 cycles, `dc` at k = 0, scaled to a mean of 1.
+
+    In the precision of the exponent. A series of one has only k = 0: 0 without `dc`.
+    """
+    k = jnp.abs(jnp.fft.fftfreq(n, 1 / n)).astype(exponent.dtype)
+    power = jnp.where(k == 0, dc, jnp.exp(-exponent * jnp.log(jnp.maximum(k, 1.0))))
+    total = power.sum()
+    return power * (n / jnp.where(total > 0, total, 1.0))
+
+
+def fading_power(n: int, exponent: Scalar) -> jax.Array:
+    """Power law [n] whose DC term, 1 of white noise, fades out toward an exponent of 1 (of either sign)."""
+    return power_law(n, exponent, jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2)
+
+
+def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None = None) -> jax.Array:
+    """Spectrum [n] of a row gain: a power law without DC term, and a share of white noise with one; None: no share.
+
+    Without a share the mean over all rows is exactly 1, whatever the exponent.
+    """
+    coloured = power_law(n, exponent)
+    return coloured if white_share is None else (1 - white_share) * coloured + white_share
+
+
+def coloured_normal(key: RandomKey, shape: tuple[int, int, int], power: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """Stationary periodic normal series along axis 1 of `shape`, with independent bins of mean `power` [shape[1]]."""
+    white = jax.random.normal(key, shape, dtype)
+    half = power[: shape[1] // 2 + 1]
+    # The square root of a zero power has a NaN gradient.
+    amplitude = jnp.where(half > 0, jnp.sqrt(jnp.where(half > 0, half, 1.0)), 0.0)
+    return jnp.fft.irfft(jnp.fft.rfft(white, axis=1) * amplitude[None, :, None], n=shape[1], axis=1)

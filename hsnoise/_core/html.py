@@ -1,0 +1,89 @@
+"""Pieces of HTML that notebooks show of a result: a conclusion, tables, sentences.
+
+Text is escaped here and nowhere else. Colours are the notebook's, light or dark, but for the dot of a conclusion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from html import escape
+from typing import Any
+
+from rich.table import Table
+
+from hsnoise._core.conclusion import Conclusion, Light
+
+COLOURS = {Light.GREEN: "#2da44e", Light.AMBER: "#d4920a", Light.RED: "#e5484d"}  # seen on white and on black
+MOST_ROWS = 40  # of a table
+LINE = "border-bottom:1px solid currentColor"
+CELL = "padding:2px 8px"
+
+
+def fragment(*pieces: str) -> str:
+    """All pieces that are not empty, one below the other."""
+    return f'<div class="hsnoise" style="max-width:60em;overflow-x:auto">{"".join(pieces)}</div>'
+
+
+def conclusion(of: Conclusion) -> str:
+    """A dot in the colour of its light, and the sentence."""
+    dot = (
+        f'<span role="img" aria-label="{of.light}" title="{of.light}" style="color:{COLOURS[of.light]}">&#9679;</span>'
+    )
+    return f"<p>{dot} <strong>{escape(of.sentence)}</strong></p>"
+
+
+def paragraph(text: str) -> str:
+    """Text with its line breaks; nothing for none."""
+    return f"<p>{escape(text).replace(chr(10), '<br>')}</p>" if text else ""
+
+
+def sentences(given: Iterable[str], title: str = "") -> str:
+    """A list below a title; nothing for no sentences."""
+    items = "".join(f"<li>{escape(one)}</li>" for one in given)
+    return f"{paragraph(title)}<ul>{items}</ul>" if items else ""
+
+
+def details(summary: str, *pieces: str) -> str:
+    """What is shown only when asked for; nothing if all pieces are empty."""
+    inside = "".join(pieces)
+    return f"<details><summary>{escape(summary)}</summary>{inside}</details>" if inside else ""
+
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[Any]], words: Collection[str] = ()) -> str:
+    """A table; columns under headings among `words` are aligned to the left, all others to the right.
+
+    Of more than MOST_ROWS rows the first are shown, and how many there are.
+    """
+    rows = list(rows)
+    left = [heading in words for heading in headings]
+    head = _row("th", headings, [f"{CELL};text-align:{'left' if one else 'right'};{LINE}" for one in left])
+    styles = [f"{CELL};text-align:left" if one else CELL for one in left]
+    body = "".join(_row("td", row, styles) for row in rows[:MOST_ROWS])
+    more = paragraph(f"{MOST_ROWS} of {len(rows)} rows") if len(rows) > MOST_ROWS else ""
+    style = "border-collapse:collapse;margin:.5em 0;text-align:right"
+    return f'<table style="{style}"><thead>{head}</thead><tbody>{body}</tbody></table>{more}'
+
+
+def printed(of: Table) -> str:
+    """A table as it is printed, with the same headings and cells; numbers to the right."""
+    headings = [str(column.header).replace("\n", " ") for column in of.columns]
+    columns = [[str(cell) for cell in column.cells] for column in of.columns]
+    is_left = [
+        one.justify == "left" and not all(map(_is_number, cells))
+        for one, cells in zip(of.columns, columns, strict=True)
+    ]
+    words = [heading for heading, left in zip(headings, is_left, strict=True) if left]
+    return table(headings, zip(*columns, strict=True), words)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.lstrip("< ") or 0)
+    except ValueError:
+        return False
+    return True
+
+
+def _row(tag: str, cells: Sequence[Any], styles: Sequence[str]) -> str:
+    made = (f'<{tag} style="{style}">{escape(str(cell))}</{tag}>' for cell, style in zip(cells, styles, strict=True))
+    return f"<tr>{''.join(made)}</tr>"

@@ -1,0 +1,121 @@
+"""What hsnoise writes: whole files or none, and frames in the formats that `hsnoise.load` reads."""
+
+from __future__ import annotations
+
+import io
+import os
+import uuid
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hsnoise._core.interrupting import unfinished
+
+FRAME_FORMATS = (".npz", ".npy", ".tif", ".tiff", ".fits")
+_EXPOSURE_TIME_TAG, _RATIONAL = 33434, 5
+MOST_DENOMINATOR = 2**32 - 1  # of a rational number in a tag
+
+
+def write_atomically(path: str | os.PathLike, content: bytes) -> None:
+    """Write a file so that a reader finds the old content or the new one, never half of it.
+
+    Raises:
+        OSError: the folder does not exist or cannot be written; an existing file is left as it was.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    with unfinished(temporary):
+        with open(temporary, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)  # atomic within a directory
+
+
+def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:
+    """Write a Matplotlib figure as PNG, all or nothing; keywords of `savefig`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", **keywords)
+    write_atomically(path, buffer.getvalue())
+
+
+def frames_file(suffix: str, counts: np.ndarray, metadata: Mapping[str, Any]) -> bytes:
+    """Content of a file of raw frames.
+
+    Args:
+        suffix: one of `FRAME_FORMATS`. Only .npz holds several exposures and all metadata; .fits holds exposure,
+            kind and Bayer order, .tif the exposure, .npy the counts alone.
+        counts: DN, `[exposure, frame, row, column]`.
+        metadata: exposure_s [exposure], kind, cfa, and what else an .npz file of `hsnoise.load` may hold.
+
+    Raises:
+        ValueError: an unknown suffix, or a format that cannot hold several exposures.
+    """
+    if suffix not in FRAME_FORMATS:
+        raise ValueError(
+            f"cannot write frames as {suffix or 'a file without suffix'}; known: {' '.join(FRAME_FORMATS)}"
+        )
+    if suffix in (".tif", ".tiff", ".fits") and len(counts) > 1:
+        raise ValueError(f"a {suffix} file holds one exposure, got {len(counts)}; write an .npz file, or one file each")
+    buffer = io.BytesIO()
+    if suffix == ".npz":
+        np.savez_compressed(buffer, counts=counts, **metadata)
+    elif suffix == ".npy":
+        np.save(buffer, counts)
+    elif suffix == ".fits":
+        _write_fits(buffer, counts[0], metadata)
+    else:
+        _write_tiff(buffer, counts[0], metadata)
+    return buffer.getvalue()
+
+
+def _write_fits(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, Any]) -> None:
+    from astropy.io import fits
+
+    header = fits.Header()
+    header["EXPTIME"] = (float(metadata["exposure_s"][0]), "s")
+    header["IMAGETYP"] = metadata["kind"]
+    if metadata["cfa"] != "mono":
+        header["BAYERPAT"] = metadata["cfa"]
+        header["ROWORDER"] = "TOP-DOWN"
+    fits.PrimaryHDU(frames, header).writeto(buffer)
+
+
+def _write_tiff(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, Any]) -> None:
+    import tifffile
+
+    exposure_s = Fraction(float(metadata["exposure_s"][0])).limit_denominator(MOST_DENOMINATOR)
+    tag = (_EXPOSURE_TIME_TAG, _RATIONAL, 1, exposure_s.as_integer_ratio(), True)
+    with tifffile.TiffWriter(buffer) as file:
+        for frame in frames:
+            file.write(frame, photometric="minisblack", metadata=None, extratags=[tag])
+
+
+def read_image(path: str | os.PathLike) -> np.ndarray:
+    """An image of light, `[row, column]` or `[row, column, 3]` in R, G, B, from .npy, .tif or .png.
+
+    Raises:
+        ValueError: an unknown format, or an array of another shape.
+        OSError: no such file.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        image = np.load(path)
+    elif suffix in (".tif", ".tiff"):
+        import tifffile
+
+        image = tifffile.imread(path)
+    elif suffix == ".png":
+        from PIL import Image
+
+        with Image.open(path) as file:
+            image = np.asarray(file)
+    else:
+        raise ValueError(f"{path}: unknown image format; known are .npy, .tif, .tiff and .png")
+    if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
+        raise ValueError(f"{path}: expected an image [row, column] or [row, column, 3], got shape {image.shape}")
+    return image

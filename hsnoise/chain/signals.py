@@ -1,0 +1,97 @@
+"""What a signal goes through in the sensor: one effect after the other."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._core.keys import named_key
+from hsnoise.chain.arrivals import Arrivals
+from hsnoise.effects import AbstractEffect, Stage
+
+SCALES = ("read_noise_scale", "dark_current_scale")  # how an effect shapes what another one draws
+
+
+def apply_by_effect(key, light, shape, effects, capture):
+    """What leaves the last effect, [frame, row, column]; each is compiled by itself."""
+    return reduce(lambda _, step: step[1], signals(key, light, shape, effects, capture), jnp.broadcast_to(light, shape))
+
+
+def signals(key, light, shape, effects, capture):
+    """Each effect and what leaves it, in turn, where `light` (e-, of `shape` or a scalar) falls on the sensor.
+
+    Raises ValueError, naming the effect, for one that returns no signal of this shape.
+    """
+    scales = {what: _scale_of(what, key, effects, capture, shape) for what in SCALES}
+    capture = dataclasses.replace(capture, **scales)
+    signal = light
+    for effect in effects:
+        try:
+            drawn = _sample_one(key, signal, shape, effect, capture)
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+            raise TypeError(
+                f"{effect.name}: JAX cannot compile its sample; use jax.numpy instead of numpy, jnp.where instead of if"
+            ) from error
+        except Exception as error:
+            error.add_note(f"in the sample of the effect {effect.name}")
+            raise
+        if drawn is None:
+            raise ValueError(f"{effect.name}: its sample returned None, expected the signal; is a return missing?")
+        if not isinstance(drawn, jax.Array):
+            raise ValueError(f"{effect.name}: its sample returned a {type(drawn).__name__}, expected one array.")
+        if np.shape(drawn) != shape:
+            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
+        if jnp.iscomplexobj(drawn):
+            raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
+        if jnp.issubdtype(drawn.dtype, jnp.integer) and effect.acts_at < Stage.DIGITAL:
+            drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; those after it expect floats
+        signal = drawn
+        yield effect, signal
+
+
+apply_in_one = partial(jax.jit, static_argnums=2)(apply_by_effect)
+
+
+def apply_fenced(key, light, shape, effects, capture):
+    """As `apply_in_one`, within a larger program. On CPUs XLA would merge the draws with what is done before and after
+    (mosaic, demosaicking), and compute them slowly and several times: as the branch of a condition they stay whole.
+    """
+
+    def draw(key, light, effects, capture):
+        return apply_in_one(key, light, shape, effects, capture)
+
+    def fenced(*of):
+        counts = jax.eval_shape(draw, *of)
+        always = jax.lax.optimization_barrier(jnp.asarray(True))
+        return jax.lax.cond(always, draw, lambda *_: jnp.zeros(counts.shape, counts.dtype), *of)
+
+    return jax.lax.platform_dependent(key, light, effects, capture, cpu=fenced, default=draw)
+
+
+def may_scale(what: str, effect: AbstractEffect) -> bool:
+    """Whether an effect shapes what another one draws; `what` of SCALES."""
+    return getattr(type(effect), what) is not getattr(AbstractEffect, what)
+
+
+def _scale_of(what, key, effects, capture, shape):
+    """Product of the factors of all effects on the read noise or dark current of each pixel; None: 1."""
+    factors = [_factor(what, key, effect, capture, shape) for effect in effects if may_scale(what, effect)]
+    factors = [factor for factor in factors if factor is not None]
+    return reduce(jnp.multiply, factors) if factors else None
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _factor(what, key, effect, capture, shape):
+    return getattr(effect, what)(capture, shape, key=named_key(key, effect.name))
+
+
+@partial(jax.jit, static_argnums=2)
+def _sample_one(key, signal, shape, effect, capture):
+    own = named_key(key, effect.stream or effect.name)
+    if isinstance(effect, Arrivals):
+        return effect.expose(signal, shape, capture, key=own)
+    return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)

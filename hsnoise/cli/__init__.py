@@ -1,0 +1,4 @@
+"""The command line: options, progress, what is printed and what is written.
+
+May import everything. `hsnoise.cli.main` is the door.
+"""

@@ -1,0 +1,164 @@
+"""The command `hsnoise enhance`: a noisy video in, an enhanced one out."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from hsnoise._core.types import channels_of
+from hsnoise.chain.photometry import GREY, frames_of_display, light_of_frames
+from hsnoise.effects import BlackLevel
+from hsnoise.enhance.mosaic import electrons_of
+from hsnoise.enhance.video import VIDEO, WRITTEN, frame_rate_of, frames_of, write_video
+from hsnoise.enhance.weights import SHIPPED, load_network
+from hsnoise.frames.io.load import load
+from hsnoise.frames.stack import FrameStack
+from hsnoise.model import NoiseModel
+from hsnoise.stlstm import STLSTM, enhance
+
+RANGES = {"--brighten": (1e-3, 1e3), "--rate": (0.01, 1000.0)}
+CLEAN = 1 / 16  # of the least variance that a network was trained on: less is another kind of video
+BLOCK = 8  # pixels, so many that most of a picture is even within them
+
+
+def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
+    """camera: of raw frames; None for a video of display values."""
+    _check(args)
+    net, about = load_network(args.weights or SHIPPED)
+    if args.weights is None:
+        low, high = about["white_e"]
+        print(
+            f"Weights that come with hsnoise, trained for {about['camera']}, white of {low:.2g} to {high:.2g}"
+            " photoelectrons; --weights takes others",
+            file=sys.stderr,
+        )
+    _check_network(args, net, about, camera)
+    light = _of_display(args, net) if camera is None else _of_counts(args, camera)
+    console = Console(stderr=True)
+    frames = enhance(net, _noted(light, about), tile=args.tile)
+    shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
+    rate = frame_rate_of(args.video, args.rate)
+    with _terminable():
+        count = write_video(args.out, (_pixels(frame) for frame in shown), rate)
+    print(f"{args.out}: {count} frames at {float(rate):g} a second")
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends what is within as an exception does: else a file that is half written would stay."""
+    if threading.current_thread() is not threading.main_thread():  # Python hands signals to no other
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """What can be told before anything is read."""
+    if args.out.suffix.lower() not in WRITTEN or args.out.is_dir():
+        raise ValueError(f"OUT: expected a video file, ending in {', '.join(WRITTEN)}, got {args.out}")
+    if not args.out.parent.is_dir():
+        raise ValueError(f"OUT: there is no folder {args.out.parent}")
+    if args.out.exists() and Path(args.video).exists() and args.out.samefile(args.video):
+        raise ValueError(f"OUT: expected another file than IN, got {args.out}, which would be lost")
+    for option, (low, high) in RANGES.items():
+        value = getattr(args, option.removeprefix("--"))
+        if not low <= value <= high:
+            raise ValueError(f"{option}: expected {low:g} to {high:g}, got {value:g}")
+    for option in ("--exposure", "--cfa"):
+        if args.camera is None and getattr(args, option.removeprefix("--")) is not None:
+            raise ValueError(f"{option}: goes with --camera, the camera of raw frames")
+
+
+def _check_network(args: argparse.Namespace, net: STLSTM, about: dict[str, Any], camera: NoiseModel | None) -> None:
+    expected = (1, 3) if camera is None else (len(camera.channels),)
+    if net.channels not in expected:
+        of = "a video has 1 or 3" if camera is None else f"the camera of {args.camera} has {expected[0]}"
+        raise ValueError(f"--weights: trained for {net.channels} channels (camera {about.get('camera')}), {of}")
+    if args.tile is not None and args.tile % net.stride:
+        raise ValueError(f"--tile: expected a multiple of {net.stride}, the stride of the network, got {args.tile}")
+
+
+def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.ndarray]:
+    """The frames of light, with a warning if the first is far cleaner than any that the network was trained on.
+
+    Those have at least the shot noise of the brightest scene, in every part of a frame. What neighbours differ by is
+    noise and picture: more than the noise, never less.
+    """
+    for number, frame in enumerate(frames):
+        if number == 0 and "white_e" in about and _is_clean(frame, max(about["white_e"])):
+            warnings.warn(
+                f"IN: has far less noise than what the weights were trained for, white of up to"
+                f" {max(about['white_e']):.3g} photoelectrons; the result may be worse than the input",
+                stacklevel=2,
+            )
+        yield frame
+
+
+def _is_clean(frame: np.ndarray, white_e: float) -> bool:
+    """Whether most blocks of light [row, column, channel] lack the shot noise of a white of so many photoelectrons."""
+    rows, columns = (n - n % BLOCK for n in frame.shape[:2])
+    blocks = frame[:rows, :columns].reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK, -1)
+    variance = np.mean(np.diff(blocks, axis=3) ** 2, (1, 3, 4)) / 2
+    clean = variance < CLEAN * blocks.mean((1, 3, 4)) / white_e
+    return 2 * np.count_nonzero(clean) > clean.size
+
+
+def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
+    try:
+        for frame in frames_of(args.video):
+            yield np.asarray(light_of_frames(frame, net.channels)) * args.brighten
+    except ValueError as error:
+        if Path(args.video).suffix.lower() in VIDEO or not Path(args.video).exists():
+            raise
+        raise ValueError(f"{error}; if these are raw frames, give --camera") from error
+
+
+def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndarray]:
+    """Light of raw frames, of a white that makes the first frame of ordinary brightness."""
+    stack = load(args.video, cfa=args.cfa, kind="flat", exposure_s=args.exposure)
+    if stack.n_exposures > 1:  # they are in the order of their exposures, not of time
+        raise ValueError(f"IN: expected frames of one exposure, got {', '.join(f'{t:g}' for t in stack.exposure_s)} s")
+    camera = _as_taken(args, camera, stack)
+    white_e = None
+    for frame in stack.frames(0):
+        electrons = np.asarray(electrons_of(frame, camera))
+        if white_e is None:
+            if not electrons.mean() > 0:
+                raise ValueError(
+                    f"IN: the first frame lies {electrons.mean():.3g} e- from black, expected light; is --camera a"
+                    f" model of this camera, and is its exposure {camera.exposure_s:g} s?"
+                )
+            white_e = float(electrons.mean()) / (GREY * args.brighten)
+        yield electrons / white_e
+
+
+def _as_taken(args: argparse.Namespace, camera: NoiseModel, stack: FrameStack) -> NoiseModel:
+    """The camera with the exposure of the frames, and with their Bayer order and black level where those are known."""
+    # Gains belong to colours; the order of these in the array is that of the frames.
+    cfa = args.cfa or (camera.cfa if stack.cfa == "mono" else stack.cfa)
+    if channels_of(cfa) != camera.channels:
+        raise ValueError(f"--camera: a model of {camera.cfa}, but the frames of {args.video} are {cfa}")
+    effects = list(camera)
+    if stack.black_level is not None:
+        effects = [effect for effect in effects if effect.name != BlackLevel.name] + [BlackLevel(stack.black_level)]
+    return NoiseModel(effects, cfa=cfa, shutter=camera.shutter, exposure_s=float(stack.exposure_s[0]))
+
+
+def _pixels(frame: np.ndarray) -> np.ndarray:
+    values = frames_of_display(frame)
+    return np.broadcast_to(values, (*values.shape[:2], 3))

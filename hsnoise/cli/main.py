@@ -1,0 +1,234 @@
+"""The command line: `hsnoise demo`, `inspect`, `fit`, `compare`, `diagnose`, `improve`, `sample` and the others."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from typing import Any
+
+from rich.console import Console
+
+import hsnoise
+from hsnoise import report
+from hsnoise._core import interrupting as _interrupting
+from hsnoise._core.arguments import counter
+from hsnoise._core.output import write_figure
+from hsnoise.cli import demo as _demo
+from hsnoise.cli import enhance as _enhance
+from hsnoise.cli import options as _options
+from hsnoise.cli import sample as _sample
+from hsnoise.cli.loading import load_capture, model_of, same_capture
+from hsnoise.cli.progress import busy, fit_with_progress
+from hsnoise.cli.results import check_folder, improve_with_progress, keep, write_results
+from hsnoise.cli.telling import (
+    Page,
+    in_options,
+    page_of_comparison,
+    page_of_diagnosis,
+    page_of_fit,
+    page_of_inspection,
+    page_of_story,
+    tell,
+)
+from hsnoise.criticism import Comparison
+from hsnoise.criticism.compare import DRAWS
+from hsnoise.frames.stack import FrameStack
+from hsnoise.simulation.draws import check_fits, part_of
+
+MEANING = """\
+One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
+reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
+`row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
+errors do not say: whether the model is right."""
+ASSUMED = 4  # sentences on the capture that are told before the work
+LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}")
+LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
+BROKEN_PIPE = 128 + 13  # as a shell has it of those whom SIGPIPE ended
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, 1 if a capture makes no fit, or 2 after an error, told in a sentence.
+
+    141 if nobody reads what it prints, 130 after Ctrl-C.
+    """
+    _interrupting.on_disk("")
+    try:
+        try:
+            return _run(argv)
+        finally:
+            sys.stdout.flush()  # a reader that is gone is noted here, not while Python ends
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except KeyboardInterrupt:
+        print(_interrupting.message(), file=sys.stderr)
+        return _interrupting.STATUS
+    finally:
+        _interrupting.nothing_left()
+
+
+def _run(argv: list[str] | None) -> int:
+    parser = _options.parser()
+    args = parser.parse_args(argv)
+    if args.command is None:
+        parser.print_help()
+        return 2
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("once")
+            warnings.showwarning = lambda message, *_, **__: console.print(
+                f"Note: {in_options(str(message))}.", style="yellow", markup=False
+            )
+            return RUN[args.command](args) or 0
+    except BrokenPipeError:
+        raise
+    except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
+        if args.debug:
+            raise
+        console.print(f"hsnoise: {_sentence(error)}", markup=False)
+        return 2
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return in_options(" ".join(str(error).split()))
+
+
+# Commands
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    stack = load_capture(args.paths, args)
+    with busy("Looking at the frames", of="frame") as say:
+        found = hsnoise.inspect(stack, progress=counter(say, "Looking at the frames"))
+    tell(page_of_inspection(found), verbose=args.verbose)
+    return 0 if found.fit_makes_sense else 1
+
+
+def _fit(args: argparse.Namespace) -> None:
+    check_folder(args.out)
+    model, stack = None if args.model is None else model_of(args.model), _load(args)
+    args.out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
+    fit = fit_with_progress(stack, args.method, model, args.pixels)
+    written = write_results(fit, args.out, {"files": args.paths})
+    if args.maps is not None:
+        fit.pixels.save(args.maps)
+        written.append(str(args.maps))
+    command = f"hsnoise compare {same_capture(args)} --model {args.out / 'model.json'}"
+    page = page_of_fit(fit, rest=(str(stack), MEANING))
+    tell(page, [f"Written to {args.out}/: {', '.join(written)}", LOOK[fit.method].format(command)], args.verbose)
+
+
+def _compare(args: argparse.Namespace) -> None:
+    _check_outputs(args)
+    model, stack = model_of(args.model), _load(args)
+    check_fits(model, stack)
+    args.out.mkdir(parents=True, exist_ok=True)
+    found = _compared(model, stack, args.seed)
+    _show(args, found, page_of_comparison(found), "comparison.png", stack, fit=model)
+
+
+def _diagnose(args: argparse.Namespace) -> None:
+    _check_outputs(args)
+    stack = _load(args)
+    part_of(stack)  # flats alone are no capture to diagnose: said before the fit
+    args.out.mkdir(parents=True, exist_ok=True)
+    fitted = fit_with_progress(stack, args.method) if args.model is None else model_of(args.model)
+    text = "Drawing every effect that may be missing"
+    with busy(text) as say:
+        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, text))
+    more: dict[str, Any] = {"fit": fitted}
+    if args.report is not None:
+        more["comparison"] = _compared(getattr(fitted, "params", fitted), stack, args.seed)
+    _show(args, found, page_of_diagnosis(found), "ranking.png", stack, **more)
+
+
+def _improve(args: argparse.Namespace) -> None:
+    _check_outputs(args)
+    stack = _load(args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
+    limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
+    story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
+    written = keep(story, args.out, source)
+    _show(args, story, page_of_story(story), "story.png", stack, (f"Written to {args.out}/: {', '.join(written)}",))
+
+
+# Work
+
+
+def _load(args: argparse.Namespace) -> FrameStack:
+    """The capture, checked; what was assumed about it is printed."""
+    stack = load_capture(args.paths, args)
+    stack.check()
+    shown = stack.assumed if args.verbose else stack.assumed[:ASSUMED]
+    for sentence in shown:
+        print(f"- {in_options(sentence)}", file=sys.stderr)
+    if len(stack.assumed) > len(shown):
+        print(f"- {len(stack.assumed) - len(shown)} more assumptions: --verbose", file=sys.stderr)
+    return stack
+
+
+def _compared(model, stack: FrameStack, seed: int) -> Comparison:
+    text = "Drawing from the model"
+    with busy(text) as say:
+        return hsnoise.compare(model, stack, seed=seed, progress=counter(say, text, DRAWS))
+
+
+def _show(
+    args: argparse.Namespace, found, page: Page, figure: str, stack: FrameStack, foot: tuple[str, ...] = (), **more: Any
+) -> None:
+    """Draw the figure of a finding, write its report, and print its page."""
+    write_figure(args.out / figure, found.plot())
+    _write_report(args, found, stack, **more)
+    reported = [] if args.report is None else [f"Reported in {args.report}"]
+    tell(page, [*foot, f"Drawn in {args.out / figure}", *reported], args.verbose)
+
+
+def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords: Any) -> None:
+    """Write the page that --report asks for, if it does."""
+    if args.report is None:
+        return
+    with busy("Writing the report"):
+        report.write_report(args.report, found, stack, files=args.paths, seed=args.seed, **keywords)
+
+
+# Output
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Before long work, so that it cannot be in vain."""
+    check_folder(args.out)
+    if args.report is not None:
+        report.check_path(args.report, made=args.out)
+
+
+def _train(args: argparse.Namespace) -> None:
+    from hsnoise.enhance.training.train import run  # optax and matplotlib are slow to import
+
+    with _interrupting.as_exception():  # it keeps the last checkpoint
+        run(args, Console(highlight=False, soft_wrap=True))
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from hsnoise.enhance.training.evaluate import run
+
+    run(args)
+
+
+RUN = {
+    "demo": _demo.run,
+    "inspect": _inspect,
+    "fit": _fit,
+    "compare": _compare,
+    "diagnose": _diagnose,
+    "improve": _improve,
+    "sample": _sample.run,
+    "enhance": lambda args: _enhance.run(args, args.camera and model_of(args.camera, "--camera")),
+    "train": _train,
+    "evaluate": _evaluate,
+}

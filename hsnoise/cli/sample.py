@@ -1,0 +1,118 @@
+"""The command `hsnoise sample`: frames with the noise of a camera."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from hsnoise._core.output import FRAME_FORMATS, frames_file, read_image, write_atomically
+from hsnoise._core.types import cfa_tile
+from hsnoise.chain.photometry import scale_to_photoelectrons
+from hsnoise.cli.loading import model_of
+from hsnoise.model import NoiseModel, sample
+
+SAMPLE_SHAPE = (480, 640)
+# What files of other formats than .npz hold of the metadata, and what `hsnoise.load` takes where nothing is said.
+HELD = {".npy": (), ".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
+BARE = {  # Python that reads the counts alone
+    ".npz": "import numpy as np; counts = np.load({})['counts']",
+    ".npy": "import numpy as np; counts = np.load({})",
+    ".tif": "import tifffile; counts = tifffile.imread({})",
+    ".tiff": "import tifffile; counts = tifffile.imread({})",
+    ".fits": "from astropy.io import fits; counts = fits.getdata({})",
+}
+DEFAULTS = {"kind": "dark", "cfa": "mono", "shutter": "rolling"}
+
+
+def run(args: argparse.Namespace) -> None:
+    suffix = args.out.suffix.lower()
+    if suffix not in FRAME_FORMATS:
+        raise ValueError(f"--out: expected a file ending in {', '.join(FRAME_FORMATS)}, got {args.out}")
+    if not args.out.parent.is_dir():
+        raise ValueError(f"--out: there is no folder {args.out.parent}")
+    if args.mean_e is not None and args.clean is None:
+        raise ValueError("--mean-e: goes with --clean, the image that it scales")
+    if args.mean_e is not None and not args.mean_e > 0:
+        raise ValueError(f"--mean-e: expected photoelectrons above 0, got {args.mean_e:g}")
+    if args.shape is not None and args.clean is not None:
+        raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
+    model = model_of(args.model, "MODEL")
+    exposures_s = args.exposure or [model.exposure_s]
+    dark = np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
+    clean = dark if args.clean is None else _clean(args.clean, args.mean_e, model)
+    counts = draw(model, exposures_s, args.frames, clean, args.seed)
+    metadata = metadata_of(model, exposures_s, "flat" if args.clean else "dark")
+    write_atomically(args.out, frames_file(suffix, counts, metadata))
+    print("\n".join(_told(args.out, counts, metadata)))
+
+
+def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]:
+    """What was written, in lines, the last one of Python that reads it."""
+    n, frames, rows, columns = counts.shape
+    what = f"{metadata['kind']} frame{'s' if n * frames > 1 else ''}"
+    exposed = " and ".join(f"{t:g} s" for t in metadata["exposure_s"])
+    lines = [
+        f"{path}: {n * frames} {what} of {rows} x {columns} pixels, exposed {exposed}",
+        f"counts in DN, {counts.min()} to {counts.max()}, {counts.dtype}; array [exposure, frame, row, column]:"
+        f" {' x '.join(map(str, counts.shape))}",
+    ]
+    if metadata["kind"] == "flat":
+        lines.append('kind "flat": a picture of light, with the dark current added; no dark frames')
+    held = HELD.get(path.suffix.lower(), tuple(metadata))
+    lines.append(f"Beside the counts the file holds {', '.join(held)}" if held else "The file holds counts only")
+    return [*lines, f"In Python: {_reading(path, n * frames, metadata, held)}"]
+
+
+def _reading(path: Path, n_frames: int, metadata: dict[str, Any], held: tuple[str, ...]) -> str:
+    """A line of Python that reads a file: counts alone where `hsnoise.load` would want more than the file holds."""
+    suffix, name = path.suffix.lower(), repr(str(path))
+    if n_frames == 1 or suffix == ".npy":
+        return BARE[suffix].format(name)
+    given = {key: value for key, value in metadata.items() if key not in held and np.any(value != DEFAULTS.get(key))}
+    return f"import hsnoise; stack = hsnoise.load({', '.join([name, *(f'{k}={_value(v)}' for k, v in given.items())])})"
+
+
+def _value(value: Any) -> str:
+    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
+
+
+def draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray, seed: int) -> np.ndarray:
+    """Counts `[exposure, frame, row, column]`, frame by frame unless what happens in one depends on those before."""
+    key = jax.random.key(seed)
+    at_once = n_frames if any(effect.in_series for effect in model) else 1
+    tasks = [(e, f) for e in range(len(exposures_s)) for f in range(0, n_frames, at_once)]
+    clean = np.broadcast_to(clean, (at_once, *clean.shape))
+    console = Console(stderr=True)
+    frames = []
+    for e, f in track(tasks, "Drawing frames", console=console, transient=True, disable=not console.is_terminal):
+        own = jax.random.fold_in(jax.random.fold_in(key, e), f)
+        frames.append(np.asarray(sample(own, clean, model, exposure_s=exposures_s[e], sensor_key=key)))
+    counts = np.stack(frames).reshape(len(exposures_s), n_frames, *clean.shape[1:])
+    return counts.astype(np.uint16) if counts.max() <= np.iinfo(np.uint16).max else counts
+
+
+def metadata_of(model: NoiseModel, exposures_s: Any, kind: str) -> dict[str, Any]:
+    metadata = {"exposure_s": np.asarray(exposures_s, float), "kind": kind, "cfa": model.cfa, "shutter": model.shutter}
+    black_level = np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(1)
+    metadata["black_level"] = black_level if np.ptp(black_level) > 0 else float(black_level[0])
+    if "adc" in model and model["adc"].white_level_dn is not None:
+        metadata["white_level"] = float(model["adc"].white_level_dn)
+    return metadata
+
+
+def _clean(path: str, mean_e: float | None, model: NoiseModel) -> np.ndarray:
+    """Expected photoelectrons `[row, column]`: of an image in R, G, B each pixel keeps its own colour."""
+    image = read_image(path).astype(np.float32)
+    if image.ndim == 3:
+        if model.cfa == "mono":
+            raise ValueError(f"{path}: a colour image, but the sensor is mono; give an image [row, column]")
+        tile = cfa_tile(model.cfa)
+        row, column = np.indices(image.shape[:2])
+        image = image[row, column, tile[row % 2, column % 2]]
+    return image if mean_e is None else np.asarray(scale_to_photoelectrons(image, mean_e))

@@ -1,0 +1,211 @@
+"""Results in the terminal: the light and a sentence, what is doubtful, a table, and what else fits on the screen."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise.cli.table import table_of
+from hsnoise.criticism import Comparison, Diagnosis, Story
+from hsnoise.criticism.finding import LEGEND
+from hsnoise.criticism.inspection.inspect import Inspection
+from hsnoise.fitting.result import TITLES, FitResult
+from hsnoise.model import NoiseModel
+from hsnoise.statistics.structure import explained
+
+LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
+OPTIONS = {
+    "exposure_s": "--exposure",
+    "black_level": "--black-level",
+    "white_level": "--white-level",
+    "cfa": "--cfa",
+    "roi": "--roi",
+    "overscan": "--overscan",
+    "shutter": "--shutter",
+    "kind": "--kind",
+    "flats": "--flats",
+    "report": "--report",
+    "model": "--model",
+    "params": "--model",
+    "seed": "--seed",
+}
+WORDS = ("added", "effect", "group of statistics", "worst group")  # headings of columns of text
+COLOURS = {Light.GREEN: "green", Light.AMBER: "yellow", Light.RED: "red"}
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is told of a result, in this order.
+
+    Attributes:
+        conclusion: the light and the sentence.
+        doubts: above the table.
+        tables: tables, or lines of text.
+        notes: what should be known; as many as fit.
+        rest: what is told with --verbose only.
+        colour: of the doubts.
+    """
+
+    conclusion: Conclusion
+    doubts: tuple[str, ...] = ()
+    tables: tuple[Table | str, ...] = ()
+    notes: tuple[str, ...] = ()
+    rest: tuple[str, ...] = ()
+    colour: str = "yellow"
+
+
+def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
+    """Print a page: what fits on one screen, how many lines were left out, and the `foot` in full; or all."""
+    console = screen()
+    doubts = [Text(f"! {in_options(one)}", page.colour) for one in page.doubts]
+    head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
+    tables = [one for table in page.tables for one in _rows(table, console)]
+    notes, rest = ([_printed(Text(in_options(one)), console) for one in part] for part in (page.notes, page.rest))
+    last = [_printed(Text(one), console) for one in foot]
+    everything = [*head, *tables, *notes, *rest]
+    room = LINES - _count(last) - 1
+    small = min(room, console.height - 1 - _count(last) - 1)
+    shown = everything if verbose else _fitting(head, tables, notes, room, small)
+    left_out = _count(everything) - _count(shown)
+    more = [f"{left_out} more line{'s' if left_out > 1 else ''}: --verbose"] if left_out else []
+    # In one piece: a reader that is gone is no reason to break off in the middle.
+    print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), flush=True)
+
+
+def in_options(text: str) -> str:
+    """A message of the library for users of the command line, who know its options, not arguments."""
+    argument, colon, rest = text.partition(":")
+    text = f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
+    with_value = re.compile(r"\b(\w+)=(?=(['\"\d])|\W|$)")
+    return with_value.sub(lambda m: f"{OPTIONS[m[1]]}{' ' if m[2] else ''}" if m[1] in OPTIONS else m[0], text)
+
+
+def screen() -> Console:
+    """The terminal; else a file in which sentences are not broken."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=COLUMNS, height=LINES + 1)
+
+
+def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | None = None) -> Page:
+    """rest: what else --verbose tells."""
+    return Page(
+        conclusion=fit.conclusion,
+        doubts=_unsaid(fit.doubts, fit.conclusion),
+        tables=(table_of(fit, truth),),
+        notes=(f"{TITLES[fit.method]}: {fit.outcome}", *(f"- {note}" for note in fit.notes)),
+        rest=rest,
+        colour="bold red" if fit.grave else "yellow",
+    )
+
+
+def page_of_comparison(found: Comparison) -> Page:
+    sentences = (*found.worst, *explained(found.worst), *found.skipped)
+    return Page(
+        found.conclusion,
+        tables=(_plain(found.as_table()),),
+        notes=tuple(f"- {one}" for one in found.worst),
+        rest=(found.measure, *(f"- {one}" for one in sentences[len(found.worst) :])),
+    )
+
+
+def page_of_diagnosis(found: Diagnosis) -> Page:
+    rest = (found.remains, LEGEND)
+    return Page(
+        found.conclusion,
+        tables=(_plain(found.as_table()),),
+        notes=tuple(f"- {one}" for one in found.sentences),
+        rest=tuple(f"- {one}" for one in rest if one),
+    )
+
+
+def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
+    """The steps, and the last fit."""
+    fit = page_of_fit(story.fit, truth=truth)
+    return Page(
+        conclusion=story.conclusion,
+        doubts=_unsaid(story.fit.doubts, story.conclusion),
+        tables=(_plain(story.as_table()), *fit.tables),
+        notes=tuple(one for one in (story.care, *fit.notes) if one),
+        rest=tuple(one for one in (*story.details, story.ended, story.split) if one),
+        colour=fit.colour,
+    )
+
+
+def page_of_inspection(found: Inspection) -> Page:
+    parts = found.parts
+    notes = [line for name in ("determined", "next") for line in parts[name].splitlines()]
+    return Page(
+        conclusion=found.conclusion,
+        doubts=found.findings,
+        tables=(f"\n{parts['capture']}\n", f"{parts['groups']}\n"),
+        notes=(*notes, *parts["assumed"].splitlines()),
+        rest=tuple(parts["budget"].splitlines()),
+    )
+
+
+def _unsaid(doubts: tuple[str, ...], conclusion: Conclusion) -> tuple[str, ...]:
+    return tuple(doubt for doubt in doubts if doubt not in conclusion.sentence)
+
+
+def _light(conclusion: Conclusion, console: Console) -> Text:
+    """A coloured disc and the sentence; where there is no colour the light is a word."""
+    if console.color_system is None or console.no_color or console.options.ascii_only:
+        return Text(str(conclusion))
+    return Text.assemble(("● ", f"bold {COLOURS[conclusion.light]}"), (conclusion.sentence, "bold"))
+
+
+def _plain(table: Table) -> Table:
+    """A result's table without its grid, numbers to the right."""
+    table.box = SIMPLE_HEAD
+    for column in table.columns:
+        column.justify = "left" if column.header in WORDS else "right"
+    return table
+
+
+Printed = tuple[str, int]  # what is printed, and how many lines of the screen that takes
+
+
+def _printed(text: Text, console: Console) -> Printed:
+    """A sentence. Where there is no terminal it stays one line, for those who search."""
+    lines = _lines(text, console)
+    if console.is_terminal:
+        return "\n".join(lines), len(lines)
+    return text.plain, len(lines)
+
+
+def _rows(table: Table | str, console: Console) -> list[Printed]:
+    if isinstance(table, Table):
+        return [(line, 1) for line in _lines(table, console)]
+    return [(line, -(-len(line) // console.width) or 1) for line in table.split("\n")]
+
+
+def _lines(one: Table | Text, console: Console) -> list[str]:
+    with console.capture() as printed:
+        console.print(one)
+    return [line.rstrip() for line in printed.get().splitlines()]
+
+
+def _count(some: Iterable[Printed]) -> int:
+    return sum(lines for _, lines in some)
+
+
+def _fitting(head: list[Printed], tables: list[Printed], notes: list[Printed], room: int, small: int) -> list[Printed]:
+    """Whole sentences and rows that fit: of the head, what half of the room holds; then the tables; then notes.
+
+    small: room on a small screen. Notes wait there; a table is rather scrolled than cut.
+    """
+    shown, used = head[:1], head[0][1]
+    for part, most in ((head[1:], room // 2), (tables, room), (notes, small)):
+        for one in part:
+            if used + one[1] > most:
+                break
+            shown.append(one)
+            used += one[1]
+    return shown

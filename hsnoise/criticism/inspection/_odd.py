@@ -1,0 +1,200 @@
+"""Frames that do not belong where they are, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hsnoise.criticism.inspection._facts import Facts, GroupFacts
+
+FAR = 6.0  # robust deviations from which a frame is odd
+LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least so much, in DN and of a pixel's noise
+LIT = 1.0  # of a pixel's noise, from which a level is no wandering black level
+SIGNIFICANT = 4.0  # standard errors of a drift
+FEWEST = 5  # frames that tell a drift
+QUIETER, NOISIER = 0.7, 1.4  # of the usual noise of a frame
+AVERAGED = 0.6  # of the variance of a shorter exposure
+UNEXPLAINED_DN_PER_E = 50.0  # a gain that no sensor has: variance that grows without signal
+BRIGHTER = 1.3  # hot pixels of a shorter exposure against a longer one's
+FLICKER = 0.02  # of a flat's level
+OFF_LINE = 0.05  # of the light of flats
+DIM = 0.05  # of the brightest flat: the light of dimmer ones is not compared
+ALIKE = 0.15  # of the signal: darks whose pixels differ less are lit
+
+
+def odd_frames(facts: Facts) -> list[str]:
+    """Sentences about unreadable, identical, odd, averaged and disordered frames."""
+    darks = [group for group in facts.groups if group.kind == "dark"]
+    said = [f"Not usable: {one}" for one in facts.unreadable]
+    said += _identical(facts.groups)
+    for group in facts.groups:
+        said += [*_levels(group, darks), *_noises(group)]
+    return [
+        *said,
+        *_order(facts.groups),
+        *_averaged(darks),
+        *_lit(darks),
+        *_swapped(darks),
+        *_unlit(facts.groups),
+        *_off_line(facts.groups),
+    ]
+
+
+def _identical(groups: Sequence[GroupFacts]) -> list[str]:
+    seen: dict[bytes, str] = {}
+    said = []
+    for group in groups:
+        for frame in group.frames:
+            if frame.fingerprint in seen:
+                said.append(
+                    f"{frame.name} ({group.name}) and {seen[frame.fingerprint]} are identical: drop one of them"
+                )
+            else:
+                seen[frame.fingerprint] = f"{frame.name} ({group.name})"
+    return said
+
+
+def _levels(group: GroupFacts, darks: Sequence[GroupFacts]) -> Iterator[str]:
+    """Frames off the level of the others, drift and settling."""
+    levels = group.levels_dn
+    if group.kind == "flat":
+        spread = np.ptp(levels) / max(np.mean(levels), 1.0)
+        if spread > FLICKER and np.ptp(levels) > np.nan_to_num(group.temporal_dn, nan=0.0):
+            yield f"The light of the {group.name} changes by {100 * spread:.0f} % of the level"
+        return
+    if len(levels) < 3:
+        if len(levels) == 2 and abs(levels[1] - levels[0]) > max(LIT * group.temporal_dn, LEAST_DN):
+            yield f"The two {group.name} differ in level: {levels[0]:.1f} and {levels[1]:.1f} DN"
+        return
+    rest = levels - _line(levels)
+    spread = 1.4826 * np.median(np.abs(rest - np.median(rest)))
+    far = np.abs(rest) > max(FAR * spread, LEAST_DN, LEAST_SHARE * group.temporal_dn)
+    usual = np.flatnonzero(~far)
+    for j in np.flatnonzero(far):
+        yield _odd_level(group, int(j), float(levels[j] - np.median(levels[usual])), darks)
+    yield from _drift(group, usual)
+
+
+def _odd_level(group: GroupFacts, j: int, off_dn: float, darks: Sequence[GroupFacts]) -> str:
+    where = f"{group.in_time[j].name} ({group.name}) lies {abs(off_dn):.1f} DN {'above' if off_dn > 0 else 'below'} the"
+    level = group.in_time[j].level_dn
+    for other in darks:
+        apart = abs(other.level_dn - group.level_dn)
+        if other is not group and apart > 2 * LEAST_DN and abs(other.level_dn - level) < 0.1 * apart:
+            return f"{where} others, at the level of the {other.name}: is its exposure right?"
+    if off_dn > LIT * group.temporal_dn:
+        return f"{where} others: light got in, or it is of another exposure or temperature; leave it out"
+    if j == 0:
+        return f"{where} later ones: the black level settles after a pause; leave the first frame out"
+    return f"{where} others: the black level jumps"
+
+
+def _drift(group: GroupFacts, usual: np.ndarray) -> Iterator[str]:
+    levels = group.levels_dn[usual]
+    if len(levels) < FEWEST:
+        return
+    x = usual - usual.mean()
+    slope = float(x @ levels / (x @ x))
+    rest = levels - levels.mean() - slope * x
+    error = np.sqrt(rest @ rest / (len(levels) - 2) / (x @ x))
+    moved = slope * np.ptp(x)
+    if abs(moved) > max(LEAST_DN, LEAST_SHARE * group.temporal_dn) and abs(slope) > SIGNIFICANT * error:
+        what = "rises" if moved > 0 else "falls"
+        yield f"The level of the {group.name} {what} from {levels[0]:.1f} to {levels[-1]:.1f} DN over the run: a drift"
+
+
+def _line(levels: np.ndarray) -> np.ndarray:
+    """A straight line through levels [frame] that single frames do not move: median of slopes, median of the rest."""
+    number = np.arange(len(levels))
+    first, second = np.triu_indices(len(levels), 1)
+    slope = np.median((levels[second] - levels[first]) / (second - first))
+    return slope * number + np.median(levels - slope * number)
+
+
+def _noises(group: GroupFacts) -> Iterator[str]:
+    """Frames of less or more noise than the others."""
+    if len(group.frames) < 3:
+        return
+    for frame in group.frames:
+        ratio = frame.noise_dn / max(group.temporal_dn, 1e-6)
+        if ratio < QUIETER:
+            yield f"{frame.name} ({group.name}) has {ratio:.2f} of the noise of the others: an average of frames?"
+        elif ratio > NOISIER:
+            yield f"{frame.name} ({group.name}) has {ratio:.1f} times the others' noise: of another gain or light?"
+
+
+def _order(groups: Sequence[GroupFacts]) -> Iterator[str]:
+    names = [group.name for group in groups if group.in_time != group.frames]
+    if names:
+        yield f"By the times in their headers, the files of the {', '.join(names)} are not named in order of time"
+
+
+def _averaged(darks: Sequence[GroupFacts]) -> Iterator[str]:
+    """Groups whose temporal variance is far below that of the others: averages."""
+    several = [group for group in darks if group.n_frames > 1]
+    for i, group in enumerate(several):
+        variance = group.temporal_dn**2
+        shorter = max((one.temporal_dn**2 for one in several[:i]), default=0.0)
+        if variance < AVERAGED * shorter:
+            ratio = shorter / max(variance, 1e-9)
+            yield f"The {group.name} have {ratio:.3g} times less temporal variance than shorter ones: averages?"
+    for one, other in zip(several, several[1:], strict=False):
+        grown = other.temporal_dn**2 - one.temporal_dn**2
+        signal = max(other.level_dn - one.level_dn, 0.0)
+        if other.temporal_dn**2 > 3 * one.temporal_dn**2 and signal * UNEXPLAINED_DN_PER_E < grown:
+            yield (
+                f"The temporal variance of the {one.name} is {other.temporal_dn**2 / max(one.temporal_dn**2, 1e-9):.3g}"
+                f" times less than that of the {other.name}, without a signal that explains it: averages of frames?"
+            )
+
+
+def _lit(darks: Sequence[GroupFacts]) -> Iterator[str]:
+    """Darks whose pixels all rise alike, which dark current does not do."""
+    if len(darks) < 2:
+        return
+    first = min(darks, key=lambda group: group.level_dn)
+    for group in darks:
+        signal = group.level_dn - first.level_dn
+        noise = np.nan_to_num(group.temporal_dn, nan=0.0)
+        if signal > max(50.0, 3 * noise) and group.hot_dn - first.hot_dn < ALIKE * signal:
+            yield (
+                f"The {group.name} lie {signal:.0f} DN above the {first.name}, and their pixels hardly differ:"
+                " light got in, or they are flats"
+            )
+
+
+def _swapped(darks: Sequence[GroupFacts]) -> Iterator[str]:
+    """Pairs of groups whose hot pixels say the opposite of their exposure."""
+    for i, short in enumerate(darks):
+        for long in darks[i + 1 :]:
+            noise = 2 * np.nan_to_num(max(short.temporal_dn, long.temporal_dn), nan=0.0)
+            if short.hot_dn > BRIGHTER * long.hot_dn + noise and short.level_dn > long.level_dn - LEAST_DN:
+                yield (
+                    f"Hot pixels of the {short.name} are brighter ({short.hot_dn:.0f} DN) than those of the {long.name}"
+                    f" ({long.hot_dn:.0f} DN): are their exposures swapped?"
+                )
+
+
+def _unlit(groups: Sequence[GroupFacts]) -> Iterator[str]:
+    darks = [group.level_dn for group in groups if group.kind == "dark"]
+    for group in groups:
+        if group.kind == "flat" and darks and group.level_dn < min(darks) + LEAST_DN:
+            yield f"The {group.name} are as dark as the darks"
+
+
+def _off_line(groups: Sequence[GroupFacts]) -> Iterator[str]:
+    """Flats off the line of the others, if most lie on one: light in proportion to exposure."""
+    flats = [group for group in groups if group.kind == "flat" and group.exposure_s > 0]
+    if len(flats) < 4:
+        return
+    darks = [group.level_dn for group in groups if group.kind == "dark"]
+    signal = np.array([group.level_dn for group in flats]) - (min(darks) if darks else 0.0)
+    rate = signal / np.array([group.exposure_s for group in flats])
+    off = (np.abs(rate / np.median(rate) - 1) > OFF_LINE) & (signal > DIM * signal.max())
+    if off.sum() <= len(flats) // 4:
+        for group, one in zip(np.array(flats, object)[off], rate[off], strict=True):
+            yield (
+                f"The {group.name} hold {one / np.median(rate):.2f} times the light that the others' exposure tells:"
+                " another lamp, or a wrong exposure?"
+            )

@@ -1,0 +1,170 @@
+"""What these frames determine, whether a fit makes sense, and which capture is worth taking next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hsnoise.criticism.budget import NoiseBudget
+from hsnoise.criticism.inspection._facts import Facts, GroupFacts
+from hsnoise.criticism.inspection._gain import Gain
+
+MOSTLY_CLIPPED = 0.3  # share of pixels at 0
+CERTAIN, ROUGH = 0.1, 0.5  # relative errors of a gain
+BEYOND_DOUBT = 20.0  # standard errors of a growth
+RISES_DN = 0.2  # of the mean, from the shortest to the longest exposure
+HOTTER_DN, HOTTER = 5.0, 1.5  # by which hot pixels rise
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Sentences about what can and cannot be had, the verdict, and the next capture worth taking."""
+
+    determined: tuple[str, ...]
+    verdict: str
+    fit_makes_sense: bool
+    next_capture: str
+
+
+def judged(
+    facts: Facts, elsewhere: Facts | None, budget: NoiseBudget | None, gain: Gain | None, is_mosaic: bool
+) -> Judgement:
+    """What can be had from these frames."""
+    darks = [group for group in facts.groups if group.kind == "dark"]
+    flats = [group for one in (facts, elsewhere) if one is not None for group in one.groups if group.kind == "flat"]
+    repeated = [group for group in darks if group.n_frames > 1]
+    against = _against_a_fit(facts, darks, flats, repeated, is_mosaic)
+    relative = growth_error(budget)
+    determined = (
+        _gain_sentence(gain, flats, relative, repeated),
+        _read_noise_sentence(repeated, gain is not None or relative < CERTAIN),
+        _dark_current_sentence(repeated, relative),
+    )
+    following = against[1] if against else _next_capture(gain, flats, darks, repeated, relative)
+    if against:
+        return Judgement(determined, f"A fit makes no sense: {against[0]}.", False, following)
+    has_gain = gain is not None or relative < CERTAIN
+    what = "gain, read noise in electrons" if has_gain else "noise in DN, but no gain: nothing in electrons"
+    current = " and dark current" if has_gain and relative < ROUGH else ""
+    return Judgement(determined, f"A fit makes sense: it tells {what}{current}.", True, following)
+
+
+def growth_error(budget: NoiseBudget | None) -> float:
+    """Relative standard error of the growth of the temporal variance of darks, the least of all colours; inf: none.
+
+    Growth without a rise of the mean counts only if it is beyond doubt: the camera may subtract its dark current.
+    """
+    if budget is None:
+        return float("inf")
+    least = BEYOND_DOUBT if not mean_rises(budget) else 0.0
+    growths = [one for (_, name), one in budget.growth.items() if name == "temporal"]
+    return min((error / slope for slope, error in growths if slope > least * error), default=float("inf"))
+
+
+def mean_rises(budget: NoiseBudget) -> bool:
+    """Whether the mean of the darks of any colour rises with exposure."""
+    means: dict[str, list[tuple[float, float]]] = {}
+    for row in budget.rows:
+        if row.kind == "dark" and row.n_frames > 1:
+            means.setdefault(row.channel, []).append((row.exposure_s, row.mean_dn))
+    return any(max(of)[1] > min(of)[1] + RISES_DN for of in means.values())
+
+
+def about_growth(budget: NoiseBudget | None) -> list[str]:
+    """Noise that grows with exposure under a mean that does not."""
+    if budget is None or mean_rises(budget) or growth_error(budget) > CERTAIN:
+        return []
+    return ["The noise of the darks grows with exposure, but not their mean: does the camera subtract dark current?"]
+
+
+def _against_a_fit(
+    facts: Facts,
+    darks: Sequence[GroupFacts],
+    flats: Sequence[GroupFacts],
+    repeated: Sequence[GroupFacts],
+    is_mosaic: bool,
+) -> tuple[str, str] | None:
+    """Why a fit makes no sense, and what to do; None if it does."""
+    if not facts.groups:
+        return "no frame can be used", "Raw frames, neither averaged nor calibrated nor scaled."
+    if not repeated and not any(group.n_frames > 1 for group in flats) and len(flats) < 2:
+        return (
+            "no exposure has two frames, so that noise and fixed pattern cannot be told apart",
+            "The same exposures again, eight frames of each.",
+        )
+    if not darks and not flats:
+        return "there are neither darks nor flats", "Darks of several exposures, eight frames of each."
+    clipped = [g for g in darks if np.mean([frame.clipped_share for frame in g.frames]) > MOSTLY_CLIPPED]
+    if darks and len(clipped) == len(darks):
+        return "most of the darks are clipped at 0", "The same darks with a higher offset (black level) of the camera."
+    prints = [frame.fingerprint for group in facts.groups for frame in group.frames]
+    if len(set(prints)) <= len(facts.groups) and len(prints) > len(facts.groups):
+        return "the frames of each exposure are copies of one", "Frames that were each exposed anew."
+    if repeated and all(group.temporal_dn < 1e-3 for group in repeated):
+        return "nothing changes from frame to frame", "Raw frames, at a higher gain if the noise is below one count."
+    if is_mosaic:
+        return "a colour mosaic is read as mono", "The same frames with their Bayer order: cfa='RGGB', say."
+    return None
+
+
+def _gain_sentence(gain: Gain | None, flats: Sequence[GroupFacts], relative: float, repeated) -> str:
+    if gain is not None:
+        return f"Gain: yes, from {gain.source}, {gain}"
+    if relative < CERTAIN:
+        return f"Gain: yes, from the growth of the noise of darks, to about {100 * relative:.1g} % at best"
+    if relative < ROUGH:
+        return f"Gain: roughly, from the growth of the noise of darks, to about {100 * relative:.0f} % at best"
+    why = "the noise of the darks does not grow with exposure" if len(repeated) > 1 else "there is nothing to compare"
+    return f"Gain: no; there are no flats in pairs, and {why}"
+
+
+def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool) -> str:
+    if not repeated:
+        return "Read noise: no; no dark exposure has two frames"
+    first = min(repeated, key=lambda group: group.exposure_s)
+    unit = "in DN and in electrons" if has_gain else "in DN only, since no gain follows"
+    return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN"
+
+
+def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> str:
+    exposures = {group.exposure_s for group in repeated}
+    if len(exposures) < 2:
+        return "Dark current: no; that needs darks of two exposures at least"
+    first, last = min(repeated, key=lambda g: g.exposure_s), max(repeated, key=lambda g: g.exposure_s)
+    if relative >= ROUGH and last.hot_dn > max(HOTTER * first.hot_dn, first.hot_dn + HOTTER_DN):
+        return "Dark current: of hot pixels, which grow with exposure; most pixels hardly do"
+    if relative >= ROUGH:
+        return "Dark current: at most a bound; neither mean nor noise grow clearly with exposure"
+    if last.level_dn <= first.level_dn:
+        return "Dark current: what the camera does not subtract; the mean does not rise"
+    rise = (last.level_dn - first.level_dn) / (last.exposure_s - first.exposure_s)
+    return f"Dark current: yes; most pixels rise by about {rise:.2g} DN/s"
+
+
+def _next_capture(
+    gain: Gain | None,
+    flats: Sequence[GroupFacts],
+    darks: Sequence[GroupFacts],
+    repeated: Sequence[GroupFacts],
+    relative: float,
+) -> str:
+    """The one capture that would tell most."""
+    if gain is None and relative >= CERTAIN:
+        return "Flats: two to four frames at each of five brightnesses up to half of saturation; they tell the gain."
+    if not repeated:
+        return "Darks: bias frames (0 s) and two longer exposures, eight frames of each."
+    single = [group.name for group in darks if group.n_frames == 1]
+    if single:
+        return f"More frames of the {', '.join(single)}: one frame tells no noise; eight are good."
+    if len({group.exposure_s for group in darks}) < 2:
+        return "Darks of a long exposure (30 to 300 s on a cooled camera), eight frames: dark current and hot pixels."
+    few = [group.name for group in darks if group.n_frames < 8]
+    if few:
+        return f"More frames of the {', '.join(few[:3])}: eight or more tell what changes from frame to frame."
+    if gain is None:
+        return "Flats in pairs at five brightnesses: they would confirm the gain that the darks tell."
+    if relative >= ROUGH:
+        return "Longer darks, until their noise grows: dark current and hot pixels would show."
+    return "More of the same would only sharpen the numbers; 32 frames of each exposure show rare and small effects."

@@ -1,0 +1,216 @@
+"""Noisy frames of clean ones: light of a scene, what the camera makes of it, and simpler noise of the same strength."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from hsnoise._core.keys import named_key
+from hsnoise._core.types import cfa_tile
+from hsnoise.chain.photometry import GREY, photoelectrons_from_illuminance
+from hsnoise.effects import BlackLevel, DarkCurrent, ReadNoise, ShotNoise
+from hsnoise.enhance.mosaic import electrons_of, mosaic
+from hsnoise.model import NoiseModel, sample
+from hsnoise.simulation import cameras
+from hsnoise.simulation.draws import black_level_of
+
+JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
+MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
+LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons of white, or lux
+NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
+Shape = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Optics:
+    """A camera's exposure and what turns the light of a scene into electrons, and its range in the paper (lux)."""
+
+    exposure_s: float
+    f_number: float
+    pixel_pitch_m: float
+    quantum_efficiency: float
+    lux: tuple[float, float]
+
+    def white_e(self, lux) -> ArrayLike:
+        """Photoelectrons of a pixel that sees a white surface in `lux`: the lens passes 1 / (4 N^2) of them."""
+        return photoelectrons_from_illuminance(
+            lux / (4 * self.f_number**2),
+            exposure_s=self.exposure_s,
+            quantum_efficiency=self.quantum_efficiency,
+            pixel_pitch_m=self.pixel_pitch_m,
+        )
+
+
+# Exposure, f-number and illuminance: Wang et al., ICCV 2019. Pitch and quantum efficiency: data sheets.
+OPTICS = {
+    "canon_5d3": Optics(0.05, 5.6, 6.25e-6, 0.49, (0.05, 0.2)),
+    "grasshopper3": Optics(0.03, 1.8, 3.45e-6, 0.60, (0.01, 0.03)),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera to train for: its noise, photoelectrons of white in dim and in bright scenes, its optics if known.
+
+    sensor: rows and columns of its frames, of which those that are drawn are a piece; None: each is a frame.
+    """
+
+    name: str
+    model: NoiseModel
+    white_e: tuple[float, float]
+    optics: Optics | None = None
+    sensor: Shape | None = None
+
+    @property
+    def channels(self) -> int:
+        return len(self.model.channels)
+
+    def in_words(self, white_e: float) -> str:
+        """The light of a scene in which white has so many photoelectrons."""
+        return f"{white_e:.2g} e-" if self.optics is None else f"{white_e / float(self.optics.white_e(1.0)):.2g} lux"
+
+
+def camera_of(
+    name: str,
+    lux: tuple[float, float] | None,
+    white_e: tuple[float, float] | None,
+    exposure_s: float | None = None,
+) -> Camera:
+    """A built-in camera, or that of a model.json with this exposure of a video frame (default: the model's own).
+
+    Raises:
+        ValueError: an unknown camera or file; light that is missing, given twice or out of range; an exposure that is
+            not above 0, or goes with a built-in camera, which has its own.
+    """
+    if lux is not None and white_e is not None:
+        raise ValueError(f"--lux, --white-e: both say how much light there is; expected one, got {lux} and {white_e}")
+    if name in OPTICS:
+        if exposure_s is not None:
+            raise ValueError(f"--exposure: goes with a model.json; {name} has {OPTICS[name].exposure_s:g} s")
+        return _built_in(name, lux, white_e)
+    if not Path(name).is_file():
+        raise ValueError(f"--camera: expected a model.json or one of {', '.join(OPTICS)}, got {name}")
+    model = NoiseModel.load(name)
+    if lux is not None or white_e is None:
+        raise ValueError("--white-e: needed with a model.json, which does not tell the optics that --lux needs")
+    if exposure_s is not None:
+        if not 0 < exposure_s < np.inf:
+            raise ValueError(f"--exposure: expected seconds above 0, got {exposure_s:g}")
+        model = at_exposure(model, exposure_s)
+    return Camera(Path(name).stem, model, checked_light("--white-e", white_e))
+
+
+def _built_in(name: str, lux: tuple[float, float] | None, white_e: tuple[float, float] | None) -> Camera:
+    model, optics = getattr(cameras, name)(), OPTICS[name]
+    if white_e is None:
+        low, high = checked_light("--lux", lux or optics.lux)
+        white_e = float(optics.white_e(low)), float(optics.white_e(high))
+    return Camera(name, model, checked_light("--white-e", white_e), optics)
+
+
+def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float]:
+    """Raise ValueError unless it is a range of light that a camera may see."""
+    low, high = light
+    if not LEAST_LIGHT <= low <= high <= MOST_LIGHT:
+        raise ValueError(f"{option}: expected low,high from {LEAST_LIGHT:g} to {MOST_LIGHT:g}, got {low:g},{high:g}")
+    return light
+
+
+def at_exposure(model: NoiseModel, exposure_s: float) -> NoiseModel:
+    """`model` with this exposure where none is given, s."""
+    return NoiseModel(model.effects, cfa=model.cfa, shutter=model.shutter, exposure_s=exposure_s)
+
+
+def noise_of(kind: str, camera: Camera) -> NoiseModel:
+    """The noise to train on: the camera's own, a simpler one of the same strength, or that of a model.json.
+
+    All at the camera's exposure.
+
+    Raises:
+        ValueError: an unknown noise, or a model of other channels than the camera's.
+    """
+    if kind == "hsnoise":
+        return camera.model
+    if kind in NOISES:
+        return matched(camera.model, kind, GREY * float(np.sqrt(np.prod(camera.white_e))))
+    if not Path(kind).is_file():
+        raise ValueError(f"--noise: expected a model.json or one of {', '.join(NOISES)}, got {kind}")
+    model = NoiseModel.load(kind)
+    if model.cfa != camera.model.cfa:
+        raise ValueError(f"--noise: {kind} is a model of cfa {model.cfa}, the camera's is {camera.model.cfa}")
+    return at_exposure(model, camera.model.exposure_s)
+
+
+def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: float | None = None) -> NoiseModel:
+    """Independent noise of the same variance in each pixel: that of the model's frames, or of `dark_variance_e2`.
+
+    "poisson-gaussian": shot noise, and read noise that makes up the variance of darks (so that variance against mean
+    is the same line, but for what row gain adds with the square of the light). "gaussian": one variance for all, that
+    at `light_e` photoelectrons.
+    """
+    light_e = light_e if kind == "gaussian" else 0.0
+    variance_e2 = _variance_e2(model, light_e) if dark_variance_e2 is None else dark_variance_e2 + light_e
+    rate = model["dark_current"].rate if "dark_current" in model else jnp.zeros(())
+    dark_e = float(rate) * model.exposure_s
+    clamp = np.asarray(model["black_clamp"].rate) * model.exposure_s if "black_clamp" in model else 0.0
+    black_level = black_level_of(model) - clamp
+    if kind == "poisson-gaussian":
+        effects = [ShotNoise(), DarkCurrent(rate), ReadNoise(float(np.sqrt(max(variance_e2 - dark_e, 1e-6))))]
+    else:
+        effects = [ReadNoise(float(np.sqrt(variance_e2)))]
+        black_level = black_level + np.asarray(model["gain"].value) * dark_e
+    effects += [model["gain"], BlackLevel(jnp.asarray(black_level)), *([model["adc"]] if "adc" in model else [])]
+    return NoiseModel(effects, cfa=model.cfa, shutter=model.shutter, exposure_s=model.exposure_s)
+
+
+def _variance_e2(model: NoiseModel, light_e: float) -> float:
+    """Temporal variance of sensor pixels in even light, mean over them, e-^2, from differences of frames."""
+    light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
+    # Before clipping: the simpler noise is clipped, too.
+    open_ended = model.remove("adc") if "adc" in model else model
+    counts = np.asarray(sample(jax.random.key(0), light, open_ended), np.float64)
+    tile = cfa_tile(model.cfa)
+    gain = np.tile(np.asarray(model["gain"].value)[tile], [n // len(tile) for n in MATCH_SHAPE])
+    return float(0.5 * np.mean((np.diff(counts, axis=0) / gain) ** 2))
+
+
+def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseModel:
+    """`model` with other numbers, about 10 % off: cameras of one make differ, and so do fits."""
+    for effect in model.effects:
+        for field, spec in effect.specs().items():
+            if spec.low != 0:
+                continue
+            value = getattr(effect, field)
+            own = named_key(key, f"{effect.name}.{field}")
+            value = value * jnp.exp(rms * jax.random.normal(own, jnp.shape(value), jnp.float32))
+            model = model.with_value(effect.name, field, value if spec.high is None else jnp.minimum(value, spec.high))
+    return model
+
+
+def noisy_of(
+    key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e, sensor: Shape | None = None
+) -> jax.Array:
+    """What comes out of frames of light [frame, row, column, channel] (white is 1), in the same units.
+
+    noise makes the counts; black level, gain and dark current of `camera` turn them back to light.
+    sensor: as in Camera; the frames lie at a random place of it. Raises ValueError if they are larger.
+    """
+    photons = mosaic(light * white_e, noise.cfa)
+    window = None if sensor is None else _somewhere(named_key(key, "place"), photons.shape, sensor, noise.cfa)
+    return electrons_of(sample(key, photons, noise, window=window), camera) / white_e
+
+
+def _somewhere(key: jax.Array, shape: tuple[int, ...], sensor: Shape, cfa: str) -> tuple:
+    """A window for frames of `shape` at a random place of the sensor, where the Bayer pattern begins."""
+    free = [most - size for most, size in zip(sensor, shape[-2:], strict=True)]
+    if min(free) < 0:
+        asked, came = (f"{rows} x {columns}" for rows, columns in (shape[-2:], sensor))
+        raise ValueError(f"--sensor: expected at least the {asked} pixels of a piece of a frame, got {came}")
+    period, keys = len(cfa_tile(cfa)), jax.random.split(key)
+    first = (period * jax.random.randint(k, (), 0, n // period + 1) for k, n in zip(keys, free, strict=True))
+    return (*first, *sensor)

@@ -1,0 +1,121 @@
+"""Steps of training: noise drawn on the fly, gradient, Adam. The same step of the same seed is always the same."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from hsnoise._core.keys import named_key
+from hsnoise.chain.photometry import display_from_linear, light_of_frames
+from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, jittered, noisy_of
+from hsnoise.enhance.training.presets import Recipe
+from hsnoise.model import NoiseModel
+from hsnoise.stlstm import STLSTM, loss
+
+
+def batch_rng(seed: int, step: int) -> np.random.Generator:
+    """Of the crops of one step: a resumed run takes those that an uninterrupted one takes."""
+    return np.random.default_rng([seed, step])
+
+
+def digest_of(*trees: Any) -> str:
+    """A hash of all that is in them: names of what things are, and numbers."""
+    found = hashlib.sha256(str(jax.tree.structure(trees)).encode())
+    for leaf in jax.tree.leaves(trees):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()
+
+
+class Trainer:
+    """A network, its optimiser, and the jitted step; the state is (arrays of the network, of the optimiser)."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        steps: int,
+        camera: Camera,
+        noise: NoiseModel,
+        perceptual: Callable | None = None,
+        jitter: float = JITTER,
+    ):
+        # Fits are in double precision, training is not.
+        single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
+        self.recipe, self.camera, self.noise = recipe, replace(camera, model=single(camera.model)), single(noise)
+        schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
+        self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        self.sharding = sharding_of_batches()
+        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter, camera.sensor)
+        self._step = eqx.filter_jit(fixed, donate="none")
+
+    def start(self, seed: int) -> tuple[STLSTM, Any]:
+        """The untrained network and its optimiser's state."""
+        recipe = self.recipe
+        key = named_key(jax.random.key(seed), "network")
+        net = STLSTM(key, maps=recipe.maps, kernels=recipe.kernels, stride=recipe.stride, channels=self.camera.channels)
+        return net, self.optimiser.init(eqx.filter(net, eqx.is_array))
+
+    def network(self, state: tuple[STLSTM, Any]) -> STLSTM:
+        return state[0]
+
+    def step(self, state: tuple[STLSTM, Any], batch: np.ndarray, seed: int, number: int):
+        """State after one more step, and the loss. batch: display values [batch, frame, row, column, 3], uint8."""
+        key = jax.random.fold_in(named_key(jax.random.key(seed), "noise"), number)
+        if self.sharding is not None and len(batch) % self.sharding.mesh.size == 0:
+            batch = jax.device_put(batch, self.sharding)
+        light = jnp.asarray(self.camera.white_e, jnp.float32)
+        return self._step(state, batch, key, self.camera.model, self.noise, light)
+
+
+def sharding_of_batches() -> jax.sharding.NamedSharding | None:
+    """Examples over all devices; None if there is one."""
+    devices = np.array(jax.devices())
+    if len(devices) == 1:
+        return None
+    return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
+
+
+def _step(optimiser, perceptual, checkpoint, jitter, sensor, state, batch, key, camera, noise, light):
+    net, memory = state
+    clean, noisy = examples(batch, key, camera, noise, light, jitter, sensor)
+
+    def value_of(net: STLSTM) -> jax.Array:
+        enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
+        return loss(enhanced, clean, perceptual)
+
+    value, slope = eqx.filter_value_and_grad(value_of)(net)
+    change, memory = optimiser.update(slope, memory)
+    return (eqx.apply_updates(net, change), memory), value
+
+
+def examples(
+    batch,
+    key,
+    camera: NoiseModel,
+    noise: NoiseModel,
+    light,
+    jitter: float = JITTER,
+    sensor: Shape | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
+
+    Each example has a camera of its own, off by `jitter`, a scene between the photoelectrons of white `light`, and a
+    place on the sensor, as in Camera.
+    """
+    linear = light_of_frames(batch, len(camera.channels))
+
+    def one(key, linear):
+        of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
+        white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
+        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e, sensor)
+
+    noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
+    return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)

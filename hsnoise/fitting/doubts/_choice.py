@@ -1,0 +1,71 @@
+"""Which fit to believe: a likelihood of pooled pixels, or pixels over time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hsnoise.fitting.doubts._evidence import Evidence
+from hsnoise.fitting.pixel_fit import PixelFit
+from hsnoise.fitting.pixel_result import result_of
+from hsnoise.fitting.result import FitResult
+from hsnoise.likelihood.summary import Summary
+from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
+
+APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
+
+
+def carries_no_gain(seen: Evidence, method: str) -> bool:
+    """Whether darks of several exposures show no growth of signal, so that their likelihood can not tell the gain.
+
+    What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
+    without them.
+    """
+    found, summary = seen.survey, seen.summary
+    if method == "line" or not can_be_transferred(found):
+        return False
+    if not found.has_exposures:  # flats tell it: a likelihood adds nothing, and rows of real sensors bend it
+        return summary.flats is not None and has_patterns(found)
+    fell = fall_of(found) is not None  # pedestals that jump so far pass for a signal
+    if variance_grows(found) and not fell:
+        return False
+    return not seen.darks.determined and (fell or not _grows(seen.darks))
+
+
+def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
+    """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
+    found, summary = seen.survey, seen.summary
+    if summary.flats is not None or not can_be_transferred(found) or not found.has_exposures or full_of_hits(found):
+        return result
+    pixel = seen.darks
+    if not pixel.determined:
+        return result
+    if result.method == "line":
+        failed = "NOT CONVERGE" in result.outcome
+        return _instead(result.outcome, pixel, summary, model, result) if failed else result
+    gain, error = np.asarray(result.physics.gain), _gain_errors(result)
+    off = np.abs(gain - pixel.estimate[: len(gain)])
+    apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)
+    if not apart.any():
+        return result
+    why = f"THE LIKELIHOOD'S GAIN, {gain[apart][0]:.3g} DN/e-, DISAGREES WITH PIXELS OVER TIME"
+    return _instead(why, pixel, summary, model, result)
+
+
+def _gain_errors(result: FitResult) -> np.ndarray:
+    return np.array([row[1] for name, row in result.table.items() if name.split(".")[0] == "gain"])
+
+
+def _errors(pixel: PixelFit) -> np.ndarray:
+    return np.sqrt(np.diagonal(pixel.covariance))[: len(pixel.channels)]
+
+
+def _grows(pixel: PixelFit) -> bool:
+    """Whether variance or mean of some colour grows with exposure beyond chance."""
+    return any(c.values[2] > 3 * np.sqrt(c.covariance[2, 2]) for c in pixel.channels)
+
+
+def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResult) -> FitResult:
+    other = result_of(pixel, summary, model, result.stack)
+    return replace(other, outcome=f"{why.partition(';')[0]}; pixel transfer instead")

@@ -1,0 +1,142 @@
+"""The budget under the fitted model beside the measured one: the components that carry a parameter must agree.
+
+Mean and noise of the typical pixel carry black level, dark current, read noise and gain; what rows share in a frame
+carries the row gain. Frames are drawn from the fit as the measured ones were taken, and both are decomposed alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from hsnoise._core.keys import named_key
+from hsnoise._core.types import seconds
+from hsnoise.fitting.result import FitResult
+from hsnoise.frames.stack import FrameStack
+from hsnoise.model import NoiseModel, sample_by_effect
+from hsnoise.statistics.decomposition import Component, mean_of
+from hsnoise.statistics.pixels.sample import without_outliers
+from hsnoise.statistics.pixels.survey import Group, Survey, survey
+
+FRAMES, SHAPE = 8, (128, 256)  # that are drawn of an exposure
+MOST_EXPOSURES = 4  # that are drawn: the shortest, the longest, and between
+NOISE_SHARE = 0.08  # of a noise, by which the two may differ
+LEVEL_NOISES, LEVEL_SHARE = 1.0, 0.1  # of a pixel's noise, and of the signal
+ROW_SHARE, ROW_NOISE = 0.5, 0.02  # of the larger one, and of the variance of a pixel
+SIGMAS = 5.0
+
+
+def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
+    """What of the measured noise the fitted model does not draw, in sentences; nothing where there is no gain."""
+    if result.stack is None or not result.has_gain or found.shortest is None:
+        return
+    chosen = _chosen(found)
+    if any(plane.narrow_dn is not None for i in chosen for plane in found.groups[i].planes):
+        return  # rounding, which two noises below a count share unequally, is most of it
+    drawn = _drawn(result.params, result.stack, [found.groups[i].exposure_s for i in chosen])
+    pairs = [(found.groups[i], group) for i, group in zip(chosen, drawn.groups, strict=True)]
+    for c, channel in enumerate(found.channels):
+        of = "" if channel == "mono" else f" of {channel}"
+        for differences in (_noise, _level, _rows):
+            _, sentence = max(differences(pairs, c, of), default=(0.0, ""))
+            if sentence:
+                yield sentence
+
+
+def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Survey:
+    """A survey of darks drawn from the model; of one size, so that a process compiles their drawing once."""
+    key = jax.random.key(0)
+    clean = np.broadcast_to(np.float32(0), (FRAMES, *SHAPE))
+    window = _middle(stack)
+    counts = [
+        sample_by_effect(
+            jax.random.fold_in(named_key(key, "frames"), e),
+            clean,
+            model,
+            exposure_s=exposure_s,
+            sensor_key=named_key(key, "sensor"),
+            window=window,
+        )
+        for e, exposure_s in enumerate(exposures_s)
+    ]
+    taken = {"cfa": stack.cfa, "shutter": stack.shutter, "white_level": stack.white_level}
+    return survey(FrameStack([np.asarray(of) for of in counts], exposure_s=exposures_s, **taken))
+
+
+def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:
+    """Where drawn frames lie on the sensor; None of a smaller one."""
+    free = [size - drawn for size, drawn in zip(stack.shape, SHAPE, strict=True)]
+    if min(free) < 0:
+        return None
+    row, column, *whole = stack.window or (0, 0, *stack.shape)
+    return row + free[0] // 4 * 2, column + free[1] // 4 * 2, whole[0], whole[1]
+
+
+def _chosen(found: Survey) -> list[int]:
+    """Which groups are drawn: darks of several frames, evenly over their exposures."""
+    repeated = [i for i, group in enumerate(found.groups) if group.kind == "dark" and group.n_frames > 1]
+    repeated.sort(key=lambda i: found.groups[i].exposure_s)
+    places = np.linspace(0, len(repeated) - 1, min(MOST_EXPOSURES, len(repeated))).round().astype(int)
+    return sorted(repeated[place] for place in places)
+
+
+def _noise(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
+    """By how much temporal noise is off, and the sentence on it."""
+    for group, drawn in pairs:
+        (measured, error), (model, chance) = _typical(group, c), _typical(drawn, c)
+        off = abs(np.sqrt(measured / max(model, 1e-12)) - 1)
+        if off > NOISE_SHARE and abs(measured - model) > SIGMAS * np.hypot(error, chance):
+            yield (
+                off,
+                f"The noise of the pixels{of} at {seconds(group.exposure_s)} is {np.sqrt(measured):.4g} DN, that of"
+                f" frames drawn from the fit {np.sqrt(model):.4g} DN: gain and read noise describe another sensor.",
+            )
+
+
+def _level(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
+    """By how much the typical pixel's level is off, and the sentence on it."""
+    lowest = min(_median(group, c) for group, _ in pairs)
+    for group, drawn in pairs:
+        level, model, noise = _median(group, c), _median(drawn, c), np.sqrt(_typical(group, c)[0])
+        off = abs(level - model)
+        if off > max(LEVEL_NOISES * noise, LEVEL_SHARE * (level - lowest)):
+            yield (
+                off / max(noise, 1e-6),
+                f"The level of the typical pixel{of} at {seconds(group.exposure_s)} is {level:.5g} DN, in frames drawn"
+                f" from the fit {model:.5g} DN: its dark signal does not grow with exposure as a dark current does.",
+            )
+
+
+def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
+    """By how much that which rows share in a frame is off, and the sentence on it."""
+    for group, drawn in pairs:
+        one, other = (_shared_by_rows(side, c) for side in (group, drawn))
+        off, noise = abs(one.variance_dn2 - other.variance_dn2), _typical(group, c)[0]
+        error = SIGMAS * np.hypot(one.standard_error_dn2, other.standard_error_dn2)
+        if off > max(ROW_NOISE * noise, error, ROW_SHARE * max(one.variance_dn2, other.variance_dn2)):
+            yield (
+                off / max(noise, 1e-6),
+                f"What a row{of} shares in a frame at {seconds(group.exposure_s)} is {_rms(one):.3g} DN, in frames"
+                f" drawn from the fit {_rms(other):.3g} DN: the row gain is wrong, or rows have noise of another kind.",
+            )
+
+
+def _typical(group: Group, c: int) -> tuple[float, float]:
+    """Temporal variance of the pixels that are no outliers, DN^2, and its standard error."""
+    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
+    kept = without_outliers(variance, group.n_frames)
+    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
+
+
+def _median(group: Group, c: int) -> float:
+    return float(np.median(np.concatenate([p.halves.level_dn.mean(0) for p in group.of(c)])))
+
+
+def _shared_by_rows(group: Group, c: int) -> Component:
+    return mean_of([plane.components["row_x_frame"] for plane in group.of(c)])
+
+
+def _rms(one: Component) -> float:
+    return float(np.sqrt(max(one.variance_dn2, 0.0)))

@@ -1,0 +1,23 @@
+"""What the checks of a fit rest on: the survey of the frames, and what pixels over time say, measured once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from hsnoise.fitting.pixel_fit import PixelFit, measure
+from hsnoise.likelihood.summary import Summary
+from hsnoise.statistics.pixels.survey import Survey
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The survey of a capture, or of a part of it, and the summary that the fit was made from."""
+
+    survey: Survey
+    summary: Summary
+
+    @cached_property
+    def darks(self) -> PixelFit:
+        """Pixel transfer of the darks, whatever the flats say."""
+        return measure(self.survey, replace(self.summary, flats=None))

@@ -1,0 +1,254 @@
+"""No number without a check: what of a fit disagrees with its frames, in sentences, and what is withheld.
+
+`_drawn`: the components that carry a parameter, measured and in frames drawn from the fit. `_stated`: what headers and
+the user said (gain, black and white level, shutter, colours). `_choice`: which of two fits to believe. Here: a gain
+that no growth of signal carries, frames, lines and pixels that are no measurement, and the order of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
+from hsnoise.fitting.doubts._drawn import disagreements
+from hsnoise.fitting.doubts._evidence import Evidence
+from hsnoise.fitting.doubts._stated import header_gain, stated
+from hsnoise.fitting.flat_notes import gain_notes
+from hsnoise.fitting.notes import order_note, pixel_notes
+from hsnoise.fitting.pixel_fit import PixelFit
+from hsnoise.fitting.pixel_result import in_electrons
+from hsnoise.fitting.result import FitResult
+from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
+from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
+from hsnoise.statistics.pixels.survey import Survey
+from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
+
+__all__ = ["Evidence", "carries_no_gain", "checked", "confirmed"]
+
+OPEN = 1.0  # error of a gain over itself from which nothing is known of it
+ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
+OFF_LINE = 3.0  # chi2 per degree of freedom
+MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
+CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
+MANY_HOT = 0.15  # share of pixels
+STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
+
+
+def checked(result: FitResult, seen: Evidence) -> FitResult:
+    """The result with its doubts, and the notes of what it does not determine."""
+    found, result = seen.survey, _without_open_gain(result)
+    checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
+    grave = [sentence for check in checks for sentence in check(result, found)]
+    grave += [*stated(result, seen), *oddities_of(found)]
+    share = _outlier_share(result)
+    minor = (
+        *header_gain(result),
+        *order_note(result),
+        *pixels_apart(found),
+        *lit_darks(found),
+        *_outliers(result),
+        *_moved_pedestals(result),
+        *_many_hot(result),
+    )
+    doubts = tuple(dict.fromkeys([*grave, *minor]))
+    notes = result.notes
+    if result.method == "transfer":
+        notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
+    notes = tuple(note for note in notes if note not in doubts)
+    return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
+
+
+def _without_open_gain(result: FitResult) -> FitResult:
+    """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
+    gains = [(value, error) for name, (value, error, _) in result.table.items() if name.split(".")[0] == "gain"]
+    if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error in gains):
+        return result
+    names = tuple(name for name in result.params.table if in_electrons(name))
+    return replace(result, withheld=tuple(dict.fromkeys((*result.withheld, *names))))
+
+
+def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
+    """Which parameters are withheld, what is known instead, and which capture would determine them."""
+    if result.has_gain:
+        return
+    pixel: PixelFit | None = result.transfer
+    if pixel is None:
+        read_dn = float(np.mean(np.asarray(result.physics.gain)) * result.physics.read_noise)
+        yield f"The gain is not determined: nothing in these darks tells it. Read noise is {read_dn:.4g} DN. {ADD}"
+        return
+    floor = float(np.mean([c.values[1] for c in pixel.channels]))
+    error = float(np.sqrt(np.mean([c.covariance[1, 1] for c in pixel.channels]) / len(pixel.channels)))
+    read_dn = np.sqrt(max(floor - ROUNDING, 0.0))
+    hot = [c.transfer for c in pixel.channels if c.transfer is not None and np.isfinite(c.transfer.hot_gain)]
+    bounds = [t for t in hot if t.hot_gain > 3 * t.hot_error]
+    if bounds:
+        low = max(min(t.hot_gain - 2 * t.hot_error for t in bounds), 0.0)
+        high = 2 * max(t.hot_gain + 2 * t.hot_error for t in bounds)
+        why = (
+            "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
+            f" lies between {low:.3g} and {high:.3g} DN/e-"
+        )
+    elif not found.has_exposures:
+        why = "darks of one exposure show no growth of signal"
+    else:
+        why = "the dark signal of ordinary pixels does not grow with exposure by enough"
+    yield (
+        f"The gain is not determined: {why}. {_named_noise(found)} is {read_dn:.4g} ±"
+        f" {error / max(2 * read_dn, 1e-9):.2g} DN. {ADD}"
+    )
+
+
+def _named_noise(found: Survey) -> str:
+    """What the noise without signal is: with one exposure, that exposure's own, dark shot noise included."""
+    shortest_s = found.shortest.exposure_s if found.shortest is not None else 0.0
+    if found.has_exposures or shortest_s == 0:
+        return "Read noise"
+    return f"The noise at {shortest_s:g} s, shot noise included,"
+
+
+def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
+    """Where pixels leave the line, and flats and darks disagree."""
+    pixel = result.transfer
+    if pixel is None:
+        return
+    for channel in pixel.channels:
+        t: Transfer | None = channel.transfer
+        of = "" if channel.name == "mono" else f" of {channel.name}"
+        if t is None or not result.has_gain or pixel.flats is not None:
+            continue  # the gain does not come from there
+        if t.chi2 > OFF_LINE * max(t.dof, 1):
+            yield (
+                f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"
+                f" {t.dof:.0f} degrees of freedom): telegraph noise, a bent response, or charge that spreads."
+            )
+    if pixel.flats is not None:
+        yield from _flats_against_darks(pixel)
+
+
+def _moved_pedestals(result: FitResult) -> Iterator[str]:
+    """Pedestals that moved: the gain does not rest on them then."""
+    pixel = result.transfer
+    for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
+        t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
+        if t is not None and t.moved.any():
+            e = int(np.argmax(t.moved))
+            yield (
+                f"The pedestal{of} moved by {t.pedestal_dn[e]:+.2g} DN at {t.classes.exposure_s[e]:g} s, more than its"
+                " frames differ: the gain comes from the differences between pixels there."
+            )
+
+
+def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
+    for c, channel in enumerate(pixel.channels):
+        t = channel.transfer
+        if t is None or not t.ordinary_error < 0.2 * abs(t.ordinary_gain):
+            continue
+        flat, error = pixel.flats.gain[c], pixel.flats.standard_error[c]
+        if abs(flat - t.gain) > max(APART_SIGMAS * np.hypot(error, t.gain_error), 2 * APART_SHARE * flat):
+            yield (
+                f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
+                " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
+            )
+
+
+def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
+    """Darks of which no exposure has two frames: nothing tells whether pixels differ."""
+    if found.darks and all(g.n_frames < 2 for g in found.darks):
+        yield (
+            "Each exposure has one dark frame, so that differences between pixels cannot be told from noise; with"
+            " them, gain and read noise are wrong by large factors. Take two frames of each exposure, better eight."
+        )
+
+
+def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
+    """Clipping of pixels whose noise differs: its correction takes the noise of a class for one."""
+    if result.transfer is None or not result.has_gain:
+        return
+    for c, _ in enumerate(found.channels):
+        clipped = max((group.clipped_share[c] for group in found.repeated_darks), default=0.0)
+        if clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
+            yield (
+                f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: what clipping takes"
+                " off is not known well, and gain and read noise may be off by several percent. Raise the black level."
+            )
+            return
+
+
+def _falling(result: FitResult, found: Survey) -> Iterator[str]:
+    """A level that falls with exposure by more than the noise of a pixel: swapped exposures, or a subtracted dark."""
+    fallen = fall_of(found)
+    if fallen is not None:
+        one, other, fall = fallen
+        yield (
+            f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than the"
+            " noise of a pixel: exposures are swapped, or the camera subtracts its dark signal."
+        )
+
+
+def _outlier_share(result: FitResult) -> float:
+    """Largest share of pixels that were set apart for an outlier."""
+    channels = result.transfer.channels if result.transfer is not None else ()
+    return max((float(c.transfer.classes.outlier_share.max()) for c in channels if c.transfer is not None), default=0.0)
+
+
+def _many_hot(result: FitResult) -> Iterator[str]:
+    """A population that the effects of the model do not describe."""
+    share = result.table.get("hot_pixels.fraction", (0.0,))[0]
+    if share > MANY_HOT:
+        yield (
+            f"{100 * share:.2g} % of the pixels came out as hot: dark currents are not log-normal with a few hot pixels"
+            " above. Their mean over all pixels is right, their distribution in the model is rough."
+        )
+
+
+def _outliers(result: FitResult) -> Iterator[str]:
+    """Pixels that were set apart because some frame of theirs holds an outlier."""
+    pixel = result.transfer
+    for channel in pixel.channels if pixel is not None else ():
+        share = 0.0 if channel.transfer is None else float(channel.transfer.classes.outlier_share.max())
+        if share > MANY_OUTLIERS:
+            of = "" if channel.name == "mono" else f" of {channel.name}"
+            yield (
+                f"{100 * share:.2g} % of the pixels{of} hold an outlier in some frame (cosmic rays, telegraph jumps):"
+                " they were set apart."
+            )
+
+
+def _of_flats(result: FitResult) -> list[str]:
+    flats = result.transfer.flats
+    return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
+
+
+def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
+    """What read noise is at most, where it is narrower than a count."""
+    planes = found.shortest.planes if found.shortest is not None else ()
+    bounds = [plane.narrow_dn[1] for plane in planes if plane.narrow_dn]
+    if not bounds or not np.isfinite(max(bounds)):
+        return
+    bound, gain = max(bounds), float(np.mean(np.asarray(result.physics.gain)))
+    electrons = f", {bound / gain:.3g} e-" if result.has_gain else ""
+    yield (
+        f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
+        f" {bound:.2g} DN{electrons}. A higher gain setting, or more bits, would show it."
+    )
+
+
+def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
+    """Static structure that a fit by pooled histograms takes for noise."""
+    if result.method == "transfer":
+        return
+    worst = 0.0
+    for c in range(len(found.channels)):
+        for group in found.darks:
+            one = static_of(found, group, c)
+            if one is not None and one.variance_dn2 > APART_SIGMAS * one.error_dn2:
+                worst = max(worst, one.variance_dn2 / max(one.temporal_dn2, 1e-12))
+    known = {"dark_signal_nonuniformity", "dark_current_nonuniformity", "hot_pixels"} & set(result.params.names)
+    if worst > STATIC_SHARE and not known:
+        yield (
+            f"Pixels differ: what stays in them is up to {worst:.0%} of what changes, and this fit takes it for noise."
+            " Its gain, dark current and read noise may be off by as much; hsnoise improve tells what is missing."
+        )

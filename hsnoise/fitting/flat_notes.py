@@ -1,0 +1,111 @@
+"""Sentences on flats: levels set aside, a bent response, a black level that falls, a header's gain that is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise._core.types import StatedGain
+from hsnoise.fitting.result import FitResult
+from hsnoise.likelihood.flat_gain import LINE_RANGE, FlatGain, variance_curve
+from hsnoise.likelihood.flats import FlatMoments
+from hsnoise.likelihood.physics import flat_gain_of
+
+FALLING_BLACK = 0.005  # of the signal, by which the overscan differs from darks
+BLACK_SIGMAS = 5.0
+WRONG, WRONG_SIGMAS = 0.08, 3.0  # of a stated gain: relative difference, standard errors
+
+
+def flat_notes(result: FitResult) -> list[str]:
+    """What is to be said of the flats of a fit."""
+    flats = result.summary.flats
+    if flats is None:
+        return []
+    return gain_notes(flat_gain_of(result.physics, flats), flats, result.summary.channels)
+
+
+def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -> list[str]:
+    """What is to be said of the gain that flats give."""
+    notes = list(flats.set_aside)
+    for c, channel in enumerate(channels):
+        of = "" if channel == "mono" else f" of channel {channel}"
+        for note in (_undetermined, _left_out, _bent, _scattered):
+            notes += note(found, c, of)
+    return notes + _falling_black(found, flats)
+
+
+def _undetermined(found: FlatGain, c: int, of: str) -> list[str]:
+    if np.isfinite(found.gain[c]):
+        return []
+    return [f"No flat level{of} has a variance above that of the darks: the flats do not determine the gain."]
+
+
+def _left_out(found: FlatGain, c: int, of: str) -> list[str]:
+    """Levels past saturation, or where the smooth curve of those below them ends."""
+    signal = found.signal_dn[:, c]
+    if not found.used[:, c].any():
+        return []
+    top = signal[found.used[:, c]].max() if found.described[c] else found.full_scale_dn[c]
+    above = signal[signal > top]
+    if not above.size:
+        return []
+    return [
+        f"The variance of the flats{of} leaves its curve above {top:.4g} DN of signal, where it bends down or falls, as"
+        f" it does near saturation: {above.size} level{'s' * (above.size > 1)} from {above.min():.4g} DN on left out."
+    ]
+
+
+def _bent(found: FlatGain, c: int, of: str) -> list[str]:
+    if not found.bend[c].any():
+        return []
+    off = float(variance_curve(found, c, found.full_scale_dn[c])) - 1
+    return [
+        f"The response{of} bends: variance over signal changes by {off:+.1%} from low signal to"
+        f" {found.full_scale_dn[c]:.4g} DN, and the gain by about {off * 2 / 3:+.1%}. The gain given is that at low"
+        " signal."
+    ]
+
+
+def _scattered(found: FlatGain, c: int, of: str) -> list[str]:
+    """Levels that no smooth curve describes."""
+    if found.described[c] or not found.used[:, c].any():
+        return []
+    levels = found.level_gain[found.used[:, c], c]
+    return [
+        f"No line and no smooth curve describes the flats{of}: variance over signal lies between {levels.min():.4g}"
+        f" and {levels.max():.4g} DN/e- (chi2 {found.chi2[c]:.0f} for {found.dof[c]} degrees of freedom). The gain is"
+        f" that of EMVA 1288's line, levels up to {LINE_RANGE:.0%} of saturation; its error is what they differ by."
+    ]
+
+
+def _falling_black(found: FlatGain, flats: FlatMoments) -> list[str]:
+    """An overscan that moves away from the level of the darks where light falls on the pixels."""
+    off = flats.overscan_dn - flats.dark_dn.mean(1)
+    signal = found.signal_dn.mean(1)
+    known = np.isfinite(off) & (signal > 0)
+    if not known.any():
+        return []
+    noise = np.sqrt(flats.dark_variance_dn2.mean(1) / flats.row_pixels.mean(1))
+    i = int(np.argmax(np.where(known, np.abs(off), -1)))
+    if abs(off[i]) < max(BLACK_SIGMAS * noise[i], FALLING_BLACK * signal[i]):
+        return []
+    share = float(np.median((off / signal)[known & found.used.any(1)])) if found.used.any() else off[i] / signal[i]
+    words = "falls" if off[i] < 0 else "rises"
+    return [
+        f"The black level {words} with the signal: the overscan lies {off[i]:+.4g} DN from the darks' level at"
+        f" {signal[i]:.4g} DN. The gain takes the level of the darks for black; from the overscan it would be"
+        f" {1 / (1 - share) - 1:+.0%} different."
+    ]
+
+
+def stated_gain_note(stated: StatedGain | None, gain_dn_per_e: float, error: float) -> list[str]:
+    """That a gain which headers state is not the sensor's; nothing where they agree or state none."""
+    if stated is None or not np.isfinite(gain_dn_per_e):
+        return []
+    off = abs(stated.value_dn_per_e - gain_dn_per_e)
+    if off <= max(WRONG * stated.value_dn_per_e, WRONG_SIGMAS * error):
+        return []
+    kind = "is wrong or nominal" if stated.certain else "is wrong, or no gain in e-/DN"
+    return [
+        f"The header states {stated.source}, but these frames say {1 / gain_dn_per_e:.3g} e-/DN"
+        f" ({gain_dn_per_e:.4g} ± {error:.2g} DN/e-): the header's value {kind}."
+    ]

@@ -1,0 +1,249 @@
+"""Sentences on what a capture does not determine, and which capture would."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+
+import numpy as np
+
+from hsnoise.fitting.flat_notes import flat_notes
+from hsnoise.fitting.profile import WEAK
+from hsnoise.fitting.result import FitResult
+from hsnoise.likelihood.summary import RowHistograms
+
+UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
+LEAST_OUTLIERS = 5  # pixels; fewer are chance
+MISPLACED_FRACTION = 0.03
+LIGHT_E_PER_S = 2e4  # a dark current above this looks like light
+LIT_SIGMA = 5.0  # standard deviations of a pixel above black that no short dark is
+WARMING, WARMING_SIGMA, FEWEST_IN_SERIES = 0.05, 8.0, 4  # share of the dark signal, standard errors, frames
+DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
+
+
+def closing_notes(result: FitResult) -> tuple[str, ...]:
+    """All sentences that belong under the table of `result`."""
+    misfit = _misfit_notes(result) if result.summary.histograms else flat_notes(result)
+    circumstances = (note(result) for note in (_left_out_note, order_note, _warming_note, _light_note))
+    return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
+
+
+def pixel_notes(result: FitResult) -> tuple[str, ...]:
+    """Sentences under the table of a fit that is conditional on the pixel: no histogram of pooled pixels is its own."""
+    circumstances = (note(result) for note in (order_note, _warming_note, _light_note))
+    return (*parameter_notes(result), *chain.from_iterable(circumstances))
+
+
+def parameter_notes(result: FitResult) -> list[str]:
+    """What the capture does not determine of the paper's effects."""
+    return [note for name, row in result.table.items() if (note := _note(name, row, result))]
+
+
+def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
+    """That a size may be 0, and what it is below, in words."""
+    return f"{name} is compatible with zero (below {f'{value + 2 * error:.2g} {unit}'.rstrip()})"
+
+
+def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:
+    value, error, unit = row
+    if np.isnan(value):  # withheld: the doubts say so
+        return None
+    parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
+    relative = error / max(abs(value), 1e-30)
+    if parameter == "gain" and relative > UNDETERMINED:
+        known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
+        return f"{name} is not determined{known}: add flats, or darks of longer exposures."
+    if parameter == "gain" and relative > WEAK:
+        return f"{name} is known to {relative:.0%} only, with read noise and dark current: add flats, or longer darks."
+    if parameter == "read_noise.sigma" and relative > UNDETERMINED:
+        in_dn = value * float(np.mean(result.physics.gain))
+        return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
+    if parameter == "dark_current.rate":
+        return _dark_current_note(value, error, result)
+    # It is a variance that is estimated: its own error is 2 value x error.
+    if parameter == "row_gain.sigma" and np.isinf(error):
+        return f"{name} is not determined: add darks of longer exposures, or flats."
+    if parameter == "row_gain.sigma" and value < 4 * error:
+        return f"{near_zero(name, value, error)}."
+    if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
+        return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
+    if parameter == "row_gain.white_share" and name in result.names and error > 0.1:
+        return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
+    has_bias = len(result.summary.exposure_s) > 0 and result.summary.exposure_s.min() == 0
+    if parameter == "black_level" and name in result.names and error > 1.0 and not has_bias:
+        known = "" if np.isinf(error) else f" ({error:.2g} DN)"
+        return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."
+    return None
+
+
+def _dark_current_note(value: float, error: float, result: FitResult) -> str | None:
+    exposures = result.summary.exposure_s
+    if len(exposures) == 0:
+        return "dark_current.rate is not determined: add dark frames."
+    if not exposures.any():
+        return "dark_current.rate is not determined: all darks are bias frames of 0 s; add darks of seconds to minutes."
+    if np.isinf(error):
+        return "dark_current.rate is not determined: add darks of other exposures, or flats."
+    if value < 2 * error:
+        longest = max(exposures)
+        return (
+            f"{near_zero('dark_current.rate', value, error, 'e-/s')};"
+            f" darks longer than {longest:g} s would determine it."
+        )
+    return None
+
+
+def outlier_fraction(result: FitResult) -> np.ndarray:
+    """Fraction of the pixels of each dark exposure in bins where the model expects none."""
+    outside, total = np.zeros(1), np.ones(1)
+    for h, expected in zip(result.summary.histograms, result.expected_histograms(), strict=True):
+        measured = h.counts.sum((1, 2), dtype=np.float64)
+        outside = outside + np.where(expected < 0.01, measured, 0).sum(1)
+        total = total + measured.sum(1)
+    return np.where(outside < LEAST_OUTLIERS, 0.0, outside / total)
+
+
+def _misfit_notes(result: FitResult) -> list[str]:
+    """What the fitted histograms miss: outliers, and a shape that the model does not have."""
+    notes = []
+    outside = result.physics.outliers
+    if outside is not None:
+        e = int(outside.argmax())
+        notes.append(
+            f"{100 * outside[e]:.2g} % of the pixels at {result.summary.exposure_s[e]:g} s follow no law of this model"
+            " (hot pixels, cosmic hits, ...): they were set apart, and the model does not reproduce them."
+        )
+    for h, (law, deviation) in zip(result.summary.histograms, result.expected_laws(), strict=True):
+        e, misplaced, chance = _misplaced(h, law, deviation, result.summary)
+        if misplaced > MISPLACED_FRACTION + 3 * chance:
+            channel = "" if h.channel == "mono" else f" of channel {h.channel}"
+            exposure_s = result.summary.exposure_s[e]
+            notes.append(
+                f"The model misplaces {misplaced:.0%} of the pixels{channel} at {exposure_s:g} s: these frames hold an"
+                " effect that it lacks; read its parameters and standard errors with that in mind."
+            )
+            break
+    return notes + flat_notes(result)
+
+
+def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int, float, float]:
+    """Exposure where the histogram is furthest off, what share of its pixels, and what chance alone would make."""
+    measured = h.counts.sum((1, 2), dtype=np.float64)
+    pixels = np.maximum(measured.sum(1, keepdims=True), 1)
+    share = 0.5 * np.abs(measured / pixels - law).sum(1)
+    rows = (h.row_pixels > 0).sum((1, 2))
+    # Coloured rows of a frame go together: count two independent ones a frame.
+    independent = rows if summary.shutter == "global" else 2 * np.asarray(summary.n_frames)
+    scatter = np.sqrt(deviation**2 / np.maximum(independent, 1)[:, None] + law / pixels)
+    chance = 0.5 * np.sqrt(2 / np.pi) * scatter.sum(1)
+    e = int((share - 3 * chance).argmax())
+    return e, float(share[e]), float(chance[e])
+
+
+def _left_out_note(result: FitResult) -> list[str]:
+    """What of a capture that would take too much memory is not in its histograms."""
+    summary = result.summary
+    used, given = sum(summary.n_frames), sum(summary.n_frames) + sum(summary.left_out)
+    step = min((h.row_stride for h in summary.histograms), default=1)
+    if used == given and step == 1:
+        return []
+    frames = f"{used} of {given} dark frames, spread evenly over each exposure" if used < given else "all dark frames"
+    rows = f", and on one row in {step} of them" if step > 1 else ""
+    return [f"To save memory, this fit rests on {frames}{rows}; the standard errors are those of what was used."]
+
+
+def order_note(result: FitResult) -> list[str]:
+    """Means that fall where the exposure grows."""
+    for h in result.summary.histograms:
+        order = np.argsort(result.summary.exposure_s, kind="stable")
+        level = _levels([h])[order]
+        if (np.diff(level) < -1).any():
+            e = int(np.diff(level).argmin())
+            short, long = result.summary.exposure_s[order[[e, e + 1]]]
+            return [
+                f"The mean count falls by {level[e] - level[e + 1]:.3g} DN from {short:g} s to {long:g} s: are the"
+                " exposures right? If so, the camera subtracts its dark level, which this model does not describe."
+            ]
+    return []
+
+
+def _warming_note(result: FitResult) -> list[str]:
+    """Means that drift from the first frame of an exposure to the last, where that is most."""
+    found = [(abs(change), change, e) for e, change in enumerate(_drifts(result)) if abs(change) > WARMING]
+    if not found:
+        return []
+    _, change, e = max(found)
+    return [
+        f"The dark signal {'rises' if change > 0 else 'falls'} by {abs(change):.0%} from the first frame at"
+        f" {result.summary.exposure_s[e]:g} s to the last: the sensor changes its temperature, or light gets in. Let it"
+        " settle before a series; hsnoise diagnose tells whether the drift matters."
+    ]
+
+
+def _drifts(result: FitResult) -> list[float]:
+    """Relative change of the dark signal over the frames of an exposure, along a straight line; 0 if within chance."""
+    summary, drifts = result.summary, []
+    least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # of a signal that may be called one
+    black = float(np.mean(np.asarray(result.physics.black_level)))
+    for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
+        pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
+        means = sum(h.row_sum[e, :frames].sum(1) for h in summary.histograms) / np.maximum(pixels, 1) - black
+        drifts.append(_trend(means) / means.mean() if frames >= FEWEST_IN_SERIES and means.mean() > least else 0.0)
+    return drifts
+
+
+def _trend(values: np.ndarray) -> float:
+    """Change from the first to the last of a series along a straight line; 0 if the scatter about it makes as much."""
+    time = np.arange(len(values)) - (len(values) - 1) / 2
+    slope = float(time @ values / (time @ time))
+    left = values - values.mean() - slope * time
+    error = np.sqrt(left @ left / (len(values) - 2) / (time @ time))
+    return slope * (len(values) - 1) if abs(slope) > WARMING_SIGMA * error else 0.0
+
+
+def _light_note(result: FitResult) -> list[str]:
+    rate = result.table.get("dark_current.rate", (0.0,))[0]
+    exposures = result.summary.exposure_s
+    if not len(exposures):
+        return []
+    levels = _levels(result.summary.histograms)
+    if len(levels) > 1 and np.ptp(exposures) == 0 and np.ptp(levels) > DRIFT_SIGMA * _noise_dn(result):
+        return [
+            f"All exposures are said to be {exposures[0]:g} s, yet their means differ, from {levels.min():.4g} to"
+            f" {levels.max():.4g} DN: check exposure_s, and whether the sensor warmed up."
+        ]
+    if _is_lit(result, levels):
+        return [
+            f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
+            f" {exposures.max():g} s: if they saw light, they are flats; pass kind='flat'."
+        ]
+    if not rate >= LIGHT_E_PER_S:
+        return []
+    return [
+        f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
+        " pass kind='flat'."
+    ]
+
+
+def _levels(histograms: Sequence[RowHistograms]) -> np.ndarray:
+    """Mean count [exposure], DN, over all these channels."""
+    total = sum(h.row_sum.sum((1, 2)) for h in histograms)
+    return total / np.maximum(sum(h.counts.sum((1, 2, 3), dtype=np.float64) for h in histograms), 1)
+
+
+def _noise_dn(result: FitResult) -> float:
+    """Standard deviation within the rows of the darks, DN, the smallest of all exposures."""
+    h = result.summary.histograms[0]
+    pixels = np.maximum(h.row_pixels, 1)
+    variance = h.row_sum_of_squares / pixels - (h.row_sum / pixels) ** 2
+    return float(np.sqrt(min(v[p > 1].mean() for v, p in zip(variance, h.row_pixels, strict=True))))
+
+
+def _is_lit(result: FitResult, levels: np.ndarray) -> bool:
+    """Signal far above a known black level that does not grow with exposure."""
+    summary = result.summary
+    if summary.black_level_dn is None or len(levels) < 2 or summary.exposure_s.max() < 1.5 * summary.exposure_s.min():
+        return False
+    signal = levels - float(np.mean(summary.black_level_dn))
+    low, high = signal[summary.exposure_s.argmin()], signal[summary.exposure_s.argmax()]
+    return bool(low > LIT_SIGMA * _noise_dn(result) and high < 1.2 * low)

@@ -1,0 +1,307 @@
+"""A fit of darks whose pixels differ: gain by pixel transfer, the rest by the components that carry it.
+
+Everything is conditional on the pixel: what stays in a pixel is no noise. The gain comes from how a pixel's variance
+over time grows with its level, or from flats where there are any; read noise from the variance that is there without
+signal; row gain from the rows' own component; and the population of pixels becomes the effects that draw it. See
+docs/likelihood.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
+from hsnoise.likelihood.flats import FlatMoments
+from hsnoise.likelihood.summary import Summary
+from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
+from hsnoise.statistics.pixels.population import Population, offset_sigma, population_of
+from hsnoise.statistics.pixels.sample import without_outliers
+from hsnoise.statistics.pixels.shading import Shading, shading_of
+from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
+from hsnoise.statistics.pixels.survey import Plane, Survey
+from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
+
+PATTERNS = {
+    "frame": "frame_offset",
+    "row": "row_fixed_pattern",
+    "column": "column_fixed_pattern",
+    "row_x_frame": "row_noise",
+    "column_x_frame": "column_noise",
+}
+DETERMINED = 0.25  # relative standard error up to which a gain is a number
+MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that jump as if a signal grew
+ROW_GAIN_THERE = 3.0
+ROUNDS = 30
+UNKNOWN = 1e6  # relative error of what is not known
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What the darks (and flats) say of one colour, in DN.
+
+    Attributes:
+        name; transfer, population: None where exposures do not differ.
+        values, covariance: gain (DN/e-), variance without signal (DN^2, rounding included), growth (DN/s); what is not
+            known has an error of UNKNOWN.
+        black_dn: level without signal and its error.
+        row_gain: variance of the gain of rows and its error.
+        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its standard
+            error, and its deviation by chance where there is none.
+        temporal_dn2: variance of the pixels themselves.
+        shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
+    """
+
+    name: str
+    transfer: Transfer | None
+    population: Population | None
+    offset_dn: tuple[float, float]
+    values: np.ndarray
+    covariance: np.ndarray
+    black_dn: tuple[float, float]
+    row_gain: tuple[float, float]
+    patterns: Mapping[str, tuple[float, float, float]]
+    temporal_dn2: float
+    shading: Mapping[str, Shading]
+
+
+@dataclass(frozen=True)
+class PixelFit:
+    """The channels, the gain of the flats if there are any, and the joint estimate with its covariance.
+
+    estimate: gain [channel], read noise (e-), dark current (e-/s); `determined` [channel] whether its gain is.
+    """
+
+    channels: tuple[Channel, ...]
+    flats: FlatGain | None
+    estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    determined: bool = False
+
+
+def measure(found: Survey, summary: Summary) -> PixelFit:
+    """Pixel transfer, flats and population of all channels, and the joint estimate."""
+    channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
+    flats = None if summary.flats is None else flat_gain(summary.flats)
+    if flats is not None and np.isfinite(flats.gain).all():
+        channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
+    estimate, covariance = _joint(channels)
+    gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
+    known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
+    known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
+    return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
+
+
+def _channel(found: Survey, c: int, name: str) -> Channel:
+    pixels = levels_of(found, c)
+    (growth, growth_error), black = _growth_of_means(found, c)
+    narrow = _narrow(found, c)
+    floor, floor_error = _temporal(found, c) if narrow is None else _of_narrow(narrow)
+    pixels = pixels if narrow is None else None  # rounding, not light, sets the variance of narrow noise
+    transfer = None if pixels is None else _transfer(pixels, found, _row_gain(found, c, growth))
+    values, population = np.array([1.0, floor, growth]), None
+    covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
+    if transfer is not None and pixels is not None:
+        values, covariance = transfer.values.copy(), transfer.covariance.copy()
+        population = _population(found, c, pixels, transfer)
+        values[2] = population.mean
+        if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
+            # Where ordinary pixels do not grow, hot ones give a bound only.
+            values[:2] = 1.0, floor
+            covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
+    rows, shading = _row_gain(found, c, values[2]), _shadings(found, c)
+    patterns = _patterns(found, c, shading)
+    offset = population.offset_sigma if population is not None else _offset(found, c)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor, shading)
+
+
+def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
+    """Pixel transfer; what a gain of rows adds to pixels that are brighter than their row is taken off before."""
+    classes = classes_of(pixels, found.full_scale_dn)
+    variance, error = row_gain
+    if variance > ROW_GAIN_THERE * error:
+        ordinary = np.median(classes.level_dn[~classes.hot], axis=0) if (~classes.hot).any() else 0.0
+        streaks = variance * (classes.level_dn - ordinary) ** 2
+        classes = replace(classes, variance_dn2=np.maximum(classes.variance_dn2 - streaks, 1e-3))
+    return pixel_transfer(classes)
+
+
+def _offset(found: Survey, c: int) -> tuple[float, float]:
+    """Standard deviation of offsets where exposures do not tell them from dark current."""
+    if found.shortest is None:
+        return 0.0, np.inf
+    pattern, low_side = _pattern(found, c)
+    return offset_sigma(pattern, 0.0, low_side)
+
+
+def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
+    """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
+    rows = len(found.sampled_rows) * plane_rows(found)
+    levels = [p.halves.level_dn for p in _shortest(found, c)]
+    low_side = float(np.mean([low_side_sigma(one, rows) for one in levels]))
+    return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
+
+
+def _shortest(found: Survey, c: int) -> list[Plane]:
+    """The planes of a channel at the shortest dark exposure of several frames; empty without one."""
+    return [] if found.shortest is None else found.shortest.of(c)
+
+
+def _shadings(found: Survey, c: int) -> dict[str, Shading]:
+    """Drifts of the black level along the rows and down the frame."""
+    planes, out = _shortest(found, c), {}
+    for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
+        if planes:
+            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
+            one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
+            out |= {} if one is None else {axis: one}
+    return out
+
+
+def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
+    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    planes, out = _shortest(found, c), {}
+    if not planes:
+        return out
+    for component, effect in PATTERNS.items():
+        shared = mean_of([plane.components[component] for plane in planes])
+        smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
+        out[effect] = shared.variance_dn2 - smooth, shared.standard_error_dn2, shared.chance_dn2
+    return out
+
+
+def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
+    """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
+    return next((p.narrow_dn for p in _shortest(found, c)), None)
+
+
+def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
+    """Variance with rounding that stands for narrow noise, and its error: the bound is two of them away."""
+    estimate, bound = narrow
+    middle = estimate if np.isfinite(estimate) else bound / 2
+    return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
+
+
+def _temporal(found: Survey, c: int) -> tuple[float, float]:
+    """Temporal variance of the pixels at the shortest exposure, DN^2, outliers set apart, and its standard error."""
+    group = found.shortest
+    if group is None:
+        return 0.0, UNKNOWN
+    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
+    variance = variance[~found.stuck(c)]
+    if not (variance > 0).any():
+        return 0.0, UNKNOWN
+    kept = without_outliers(variance, group.n_frames)
+    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
+
+
+def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Growth of the median pixel with exposure, DN/s, and level without signal, DN, each with its standard error."""
+    darks = found.darks
+    t = np.array([g.exposure_s for g in darks])
+    planes = [g.of(c) for g in darks]
+    level = np.array([np.mean([_level(p) for p in of]) for of in planes])
+    frames = [
+        np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
+        for of in planes
+    ]
+    scatter = np.sqrt(np.mean([of.var(ddof=1) for of in frames if len(of) > 1] or [1.0]))
+    error = np.array([max(scatter, 1e-6) / np.sqrt(len(of)) for of in frames])
+    if np.ptp(t) == 0:
+        mean_error = float(1 / np.sqrt((error**-2.0).sum()))
+        return (0.0, UNKNOWN), (float(level.mean()), mean_error if t.max() == 0 else UNKNOWN)
+    design = np.stack([np.ones_like(t), t], 1) / error[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    theta = covariance @ design.T @ (level / error)
+    left = (level - theta[0] - theta[1] * t) / error
+    covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
+    slope_error = float(np.sqrt(covariance[1, 1]))
+    # Pixels differ in growth, so that the median's is no straight line: back to 0 s from the shortest exposure.
+    shortest = int(t.argmin())
+    black = float(level[shortest] - theta[1] * t[shortest])
+    return (float(theta[1]), slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
+
+
+def _level(plane: Plane) -> float:
+    """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
+    if plane.narrow_dn is not None:  # most pixels hold one count, and the median is that
+        return float(plane.row_mean_dn.mean())
+    return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
+
+
+def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
+    t = pixels.exposure_s
+    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
+    shift = float(slopes @ transfer.pedestal_dn)
+    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, *_pattern(found, c))
+
+
+def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
+    """Variance of the gain of rows: how the variance of row means grows with the square of the signal; its error."""
+    groups = found.repeated_darks
+    signal = growth * np.array([g.exposure_s for g in groups])
+    parts = [[p.components["row_x_frame"] for p in g.of(c)] for g in groups]
+    y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
+    error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
+    if len(groups) < 2 or np.ptp(signal) <= 0:
+        return 0.0, UNKNOWN
+    design = np.stack([np.ones_like(signal), signal**2], 1) / error[:, None]
+    covariance = np.linalg.pinv(design.T @ design)
+    theta = covariance @ design.T @ (y / error)
+    error_of_gain = float(np.sqrt(covariance[1, 1]))
+    return (float(theta[1]), error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
+
+
+def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
+    """The channel with the gain, and the gain of rows, that its flats give; those of its darks are left for a check."""
+    values, covariance = one.values.copy(), one.covariance.copy()
+    values[0] = flats.gain[c]
+    covariance[0], covariance[:, 0] = 0.0, 0.0
+    covariance[0, 0] = flats.standard_error[c] ** 2
+    rows = row_gain_of(moments, flats.signal_dn[:, c], c)
+    return replace(one, values=values, covariance=covariance, row_gain=rows)
+
+
+def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
+    """Gain [channel], read noise and dark current in electrons, which all colours share, by least squares."""
+    n = len(channels)
+    if all(one.covariance[0, 0] >= UNKNOWN**2 for one in channels):
+        return np.append(np.ones(n), [0.0, 0.0]), np.eye(n + 2) * UNKNOWN**2
+    data = np.concatenate([_without_rows(one) for one in channels])
+    weight = np.zeros((3 * n, 3 * n))
+    for c, one in enumerate(channels):
+        weight[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] = np.linalg.inv(one.covariance + np.diag([0, 1e-12, 1e-24]))
+    known = [c for c in range(n) if channels[c].covariance[0, 0] < (UNKNOWN / 2) ** 2]
+    gain = np.array([one.values[0] if c in known else np.nan for c, one in enumerate(channels)])
+    gain = np.where(np.isnan(gain), np.nanmean(gain) if known else 1.0, gain)
+    floor = np.array([max(data[3 * c + 1], 1e-6) for c in range(n)])
+    theta = np.concatenate([gain, [float(np.sqrt(np.mean(floor / gain**2)))], [float(np.mean(data[2::3] / gain))]])
+    for _ in range(ROUNDS):
+        model, slopes = _expected(theta, n)
+        information = slopes.T @ weight @ slopes + np.diag(np.append(np.full(n, 1e-14), [1e-14, 1e-14]))
+        step = np.linalg.solve(information, slopes.T @ weight @ (data - model))
+        theta = theta + np.clip(step, -0.5 * np.abs(theta) - 1e-9, 0.5 * np.abs(theta) + 1e-9)
+    off = data - model
+    chi2 = float(off @ weight @ off) / max(2 * n - 2, 1) if n > 1 else 1.0
+    return theta, np.linalg.inv(information) * max(chi2, 1.0)
+
+
+def _without_rows(one: Channel) -> np.ndarray:
+    """Gain, variance without signal less rounding, growth; what the gain of rows adds to variances taken off."""
+    widened = 1 + (one.row_gain[0] if one.row_gain[0] > ROW_GAIN_THERE * one.row_gain[1] else 0.0)
+    return np.array([one.values[0] / widened, (one.values[1] - ROUNDING) / widened, one.values[2]])
+
+
+def _expected(theta: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gain, variance and growth of each channel, and their derivatives."""
+    gain, sigma, rate = theta[:n], theta[n], theta[n + 1]
+    model, slopes = np.empty(3 * n), np.zeros((3 * n, n + 2))
+    model[0::3], model[1::3], model[2::3] = gain, gain**2 * sigma**2, gain * rate
+    for c in range(n):
+        slopes[3 * c, c] = 1
+        slopes[3 * c + 1, [c, n]] = 2 * gain[c] * sigma**2, 2 * gain[c] ** 2 * sigma
+        slopes[3 * c + 2, [c, n + 1]] = rate, gain[c]
+    return model, slopes

@@ -1,0 +1,256 @@
+"""What a fit returns: parameters, standard errors, and how it went."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hsnoise._core import html as _html
+from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.data_frames import table_to_pandas
+from hsnoise._core.types import unit_in_words
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood import rows
+from hsnoise.likelihood.physics import Physics, binning, dark_laws, log_probability
+from hsnoise.likelihood.summary import Summary, without_counts
+from hsnoise.model import NoiseModel
+from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
+
+TITLES = {
+    "ml": "Joint maximum likelihood",
+    "line": "Line fit",
+    "transfer": "Pixel transfer",
+    "synthetic": "Base fit, corrected for added effects by simulated statistics",
+}
+
+NOT_CONVERGED = "NOT CONVERGED: "
+AGREES = "Nothing in these frames contradicts these numbers. Compare tells whether frames drawn from them look alike."
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted camera.
+
+    Attributes:
+        params: the NoiseModel, for `hsnoise.sample`, `save`, ...
+        names, covariance: fitted parameters and their covariance, in the units of `table`.
+        method: "ml", "line", "transfer" where pixels differ, or "synthetic" with effects beyond the paper's.
+        outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
+        log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
+        notes: sentences on what the data do not determine, and which capture would.
+        summary: the row histograms and photon transfer that were fitted.
+        physics: the same parameters as `hsnoise.physics` takes them.
+        doubts: sentences on what disagrees, and on what is withheld; printed above the table.
+        grave: whether one of them says that a parameter may be wrong; others tell what was set apart.
+        withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
+            DN then (gain 1 DN/e-), so that darks are still drawn with the right noise.
+        added: effects of `params` that the fit put in because the pixels differ.
+        transfer: what pixel transfer found, where pixels differ: `hsnoise.pixel_fit.PixelFit`; else None.
+        stack: the frames, for `pixels`.
+    """
+
+    params: NoiseModel
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    method: str
+    outcome: str
+    iterations: int
+    log_likelihood: float
+    notes: tuple[str, ...]
+    summary: Summary
+    physics: Physics
+    doubts: tuple[str, ...] = ()
+    grave: bool = False
+    withheld: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    transfer: Any = None
+    stack: FrameStack | None = None
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
+        return self.converged and not self.grave
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """Whether these numbers may be used, and the first reason against it."""
+        if not self.converged:
+            return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
+        if not self.doubts:
+            return Conclusion(Light.GREEN, AGREES)
+        first = self.doubts[0]
+        others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
+        # That there is no gain is no error: noise in DN can be used.
+        if not self.has_gain and not others:
+            return Conclusion(Light.AMBER, f"In DN only. {first}")
+        if self.grave:
+            return Conclusion(Light.RED, f"Do not use these numbers. {first}{others}")
+        return Conclusion(Light.AMBER, f"Usable, with doubts. {first}{others}")
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
+        return not any(name.split(".")[0] == "gain" for name in self.withheld)
+
+    @cached_property
+    def pixels(self) -> PixelMaps:
+        """Maps of offset, dark current, noise and flags of each pixel; the frames are read once more.
+
+        Raises ValueError where a summary was fitted, which has no frames, or no dark exposure has two frames.
+        """
+        if self.stack is None:
+            raise ValueError("pixels: this fit has no frames, it was made from a Summary or from flats")
+        return pixel_maps(self.stack, np.asarray(self.physics.gain) if self.has_gain else None)
+
+    @property
+    def table(self) -> dict[str, tuple[float, float, str]]:
+        """Parameter name to (value, standard error, unit); the error is 0 for a value that was held, not fitted,
+        and infinite where the capture says nothing."""
+        fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
+        rows_ = {}
+        for name, (value, _, unit) in self.params.table.items():
+            if name in self.withheld:
+                rows_[name] = (float("nan"), float("inf"), unit)
+                continue
+            error = float(fitted.get(name, np.inf if name == "dark_current.rate" else 0.0))
+            rows_[name] = (value, error, unit)
+        return rows_
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit ended where it should."""
+        return not self.outcome.startswith(NOT_CONVERGED)
+
+    def without(self, names: tuple[str, ...]) -> FitResult:
+        """The same fit without some of the effects that it put in by itself; other numbers stay as they are."""
+        params = self.params
+        for name in names:
+            params = params.remove(name)
+        table = params.table
+        kept = [i for i, name in enumerate(self.names) if name in table]
+        return replace(
+            self,
+            params=params,
+            names=tuple(self.names[i] for i in kept),
+            covariance=self.covariance[np.ix_(kept, kept)],
+            withheld=tuple(name for name in self.withheld if name in table),
+            added=tuple(name for name in self.added if name not in names),
+        )
+
+    def with_notes(self, notes: tuple[str, ...]) -> FitResult:
+        return replace(self, notes=notes)
+
+    def expected_histograms(self) -> tuple[np.ndarray, ...]:
+        """Counts that the model expects in the bins of `summary.histograms`: for each channel [exposure, bin]."""
+        return tuple(
+            law * h.row_pixels.sum((1, 2))[:, None]
+            for h, (law, _) in zip(self.summary.histograms, self.expected_laws(), strict=True)
+        )
+
+    def expected_laws(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each channel [exposure, bin]: probability of a bin over all row gains, and its deviation between rows."""
+        with jax.enable_x64(True):
+            physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self.physics)
+            light = without_counts(self.summary)
+            found = (
+                _expected(physics, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
+            )
+            return [jax.tree.map(np.asarray, laws) for laws in found]
+
+    def to_pandas(self) -> Any:
+        """`table` as a pandas DataFrame: parameter, value, standard_error, unit (needs `hsnoise[pandas]`).
+
+        Raises ImportError without pandas.
+        """
+        return table_to_pandas(self)
+
+    @property
+    def _title(self) -> str:
+        exposures = len(self.summary.exposure_s)
+        darks = f"{sum(self.summary.n_frames)} dark frames at {exposures} exposure{'s' if exposures != 1 else ''}"
+        flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
+        return f"{TITLES[self.method]}: {darks}{flats}"
+
+    def _rounded_table(self) -> Table:
+        table = Table()
+        for heading in ("parameter", "value", "standard error", "unit"):
+            table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+        for name, (value, error, unit) in self.table.items():
+            table.add_row(name, *rounded(value, error), unit_in_words(unit))
+        return table
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None)
+        console.print(str(self.conclusion), markup=False, highlight=False)
+        console.print(self._title, highlight=False)
+        for doubt in self.doubts:
+            console.print(f"! {doubt}", highlight=False)
+        console.print(self._rounded_table())
+        console.print(f"{self.outcome}; {self.iterations} iterations", highlight=False)
+        for note in self.notes:
+            console.print(f"- {note}", highlight=False)
+        return console.file.getvalue().rstrip()
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        conclusion = self.conclusion
+        return _html.fragment(
+            _html.conclusion(conclusion),
+            _html.sentences(doubt for doubt in self.doubts if doubt not in conclusion.sentence),
+            _html.paragraph(self._title),
+            _html.printed(self._rounded_table()),
+            _html.details(
+                f"How it ended, and {len(self.notes)} note{'s' if len(self.notes) != 1 else ''}",
+                _html.paragraph(f"{self.outcome}; {self.iterations} iterations"),
+                _html.sentences(self.notes),
+            ),
+        )
+
+
+@jax.jit
+def _expected(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
+    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin]."""
+    beta, weight = jnp.ones(1), jnp.ones(1)
+    if physics.row_sigma is not None:
+        sigma = jnp.maximum(physics.row_sigma[c], 1e-6)
+        nodes = rows.make_nodes(jnp.zeros(1), (1 + rows.PRIOR_REACH * sigma)[None], 0.1, sigma, 256)
+        beta, density = nodes.beta[0], jax.scipy.stats.norm.pdf(nodes.beta[0], 1.0, sigma)
+        weight = jnp.exp(nodes.log_weight[0]) * density
+        weight = weight.at[0].add(jax.scipy.stats.norm.cdf((beta[0] - 1) / sigma))
+
+    def exposure(at):
+        law = jnp.exp(log_probability(physics, at, beta))
+        share = weight / weight.sum()
+        mixed = share @ law
+        return mixed / mixed.sum(), jnp.sqrt(share @ (law - mixed[None, :]) ** 2)
+
+    exposures = len(summary.exposure_s)
+    laws = dark_laws(physics, summary.exposure_s)
+    at = binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures), edges_dn, outlier_law)
+    return jax.lax.map(exposure, at)
+
+
+def rounded(value: float, error: float) -> tuple[str, str]:
+    """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
+    if np.isnan(value):
+        return "not determined", ""
+    if not (np.isfinite(error) and error > 0):
+        return f"{value:.5g}", "held" if error == 0 else "not determined"
+    digits = max(1 if 0 < abs(value) < 10 else 0, 1 - int(np.floor(np.log10(error))))
+    if digits > 6 and abs(value) < 1e-4 or error >= 1e4:
+        return f"{value:.3e}", f"{error:.1e}"
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
+
+
+def number(value: float) -> str:
+    """Three digits, without exponent up to a million."""
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"

@@ -1,0 +1,82 @@
+"""Checks of the values of raw frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hsnoise._core.types import channels_of
+from hsnoise.frames.bayer import channel_pixels
+
+
+def check_values(frame: np.ndarray, *, white_level: float | None = None, name: str = "counts") -> None:
+    """Check the values of one raw frame `[row, column]`, DN.
+
+    Args:
+        frame: counts as stored, of any real dtype.
+        white_level: DN at which the sensor saturates; None: unknown.
+        name: what to call the frame in an error.
+
+    Raises:
+        ValueError: values that are not finite, not integers, negative, too large, all the same, or mostly at
+            the white level.
+    """
+    if frame.dtype.kind == "f":
+        if not np.isfinite(frame).all():
+            raise ValueError(f"{name}: counts must be finite, got NaN or infinity")
+        if (frame != np.rint(frame)).any():
+            raise ValueError(
+                f"{name}: counts must be integers (DN), got fractions; give the raw counts, "
+                "do not normalise, scale or average them"
+            )
+    low, high = frame.min(), frame.max()
+    if low < 0:
+        raise ValueError(
+            f"{name}: counts must be >= 0, got {low:g}; subtracting a dark makes counts negative; give the raw frames"
+        )
+    if high > np.iinfo(np.int32).max:
+        raise ValueError(f"{name}: counts must fit in 31 bits, got {high:g}")
+    if low == high:
+        what = "all zero" if high == 0 else f"all {high:g}"
+        raise ValueError(f"{name}: counts are {what}; a frame without any noise cannot be raw sensor data")
+    if white_level is not None and high >= white_level:
+        saturated = np.mean(frame >= white_level)
+        if saturated > 0.5:
+            raise ValueError(
+                f"{name}: {saturated:.0%} of the pixels reach white_level {white_level:g} DN (saturated); "
+                "shorten the exposure or correct white_level"
+            )
+
+
+def check_black_level(frames: Sequence[np.ndarray], black_level: Any, cfa: str) -> None:
+    """Check that black lies below the counts of some exposure.
+
+    A black level above the median of every exposure (by more than the noise: rounding and a camera that
+    subtracts its dark current may put the median a little below black) cannot be right.
+
+    Args:
+        frames: one frame `[row, column]` of each exposure, DN.
+        black_level: DN, None, one value or one a channel.
+        cfa: "mono" or Bayer order of the frames' first pixel.
+
+    Raises:
+        ValueError: the black level lies above the data.
+    """
+    if black_level is None:
+        return
+    channels = channels_of(cfa)
+    for channel, level in zip(channels, np.broadcast_to(black_level, len(channels)), strict=True):
+        quantiles = [np.percentile(_thin(channel_pixels(frame, cfa, channel)), [16, 50, 84]) for frame in frames]
+        if all(level > median + max(1.0, (high - low) / 2) for low, median, high in quantiles):
+            highest = max(median for _, median, _ in quantiles)
+            raise ValueError(
+                f"black_level {level:g} DN lies above the data: the median of channel {channel} is at most "
+                f"{highest:g} DN in all exposures; give the true level in DN, or None to have it estimated"
+            )
+
+
+def _thin(values: np.ndarray, limit: int = 1_000_000) -> np.ndarray:
+    """About `limit` of the values, evenly spread: enough for a median."""
+    return values[:: max(1, values.size // limit)]

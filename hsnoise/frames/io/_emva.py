@@ -1,0 +1,46 @@
+"""Folders with a descriptor of the EMVA 1288 standard, EMVA1288_Data.txt, which says what each image is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+from hsnoise.frames.io._files import reader_name
+from hsnoise.frames.io._recording import Recording, naming
+
+DESCRIPTOR = "EMVA1288_Data.txt"
+KINDS = {"b": "flat", "d": "dark"}  # bright, dark
+
+
+def read(folder: Path) -> list[Recording]:
+    """The images that the descriptor names, with kind and exposure; white is the largest code of its bits.
+
+    Its lines: `n bits rows columns`; `b exposure_ns photons` or `d exposure_ns`; below it `i image` for each.
+
+    Raises:
+        ValueError: a line that does not follow this, or an image that cannot be read.
+    """
+    path = folder / DESCRIPTOR
+    with naming(path):
+        return list(_images(path))
+
+
+def _images(path: Path) -> Iterator[Recording]:
+    kind, exposure_s, white_level = "", 0.0, None
+    for line in path.read_text().splitlines():
+        word, *values = line.split() or ["#"]
+        if word == "n":
+            white_level = float(2 ** int(values[0]) - 1)
+        elif word in KINDS:
+            kind, exposure_s = KINDS[word], float(values[0]) * 1e-9
+        elif word == "i":
+            image = path.parent / values[0].replace("\\", "/")
+            reader = reader_name(image)
+            if reader is None or not kind:
+                raise ValueError(f"expected images of a known format below a line 'b' or 'd', got {line!r}")
+            for recording in import_module(f"hsnoise.frames.io.{reader}").read(image):
+                yield replace(recording, kind=kind, exposure_s=exposure_s, white_level=white_level)
+        elif word != "v" and not word.startswith("#"):
+            raise ValueError(f"expected lines that begin with n, b, d, i, v or #, got {line!r}")

@@ -1,0 +1,82 @@
+"""Flats of one exposure but of different light: levels of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from hsnoise.frames.io._recording import Recording
+
+SAME_LIGHT = 0.05  # of the signal: frames further apart are of another light
+STEADY_DN = 5.0  # differences that a wandering black level may make
+THIN = 5  # odd, so that all colours of a mosaic are met; every such row and column is enough for a mean
+SATURATED = 0.5  # share of pixels at white from which on a frame tells nothing
+READERS = 2  # files that are decoded at a time
+
+Groups = list[list[Recording]]
+
+
+def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> tuple[Groups, list[str]]:
+    """Groups of flats split by filter and light, darker first, and what was found; groups of darks as they are.
+
+    A thinned mean of the first frame of each file is compared. Flats that are mostly at `white_level` are left out.
+    """
+    out: Groups = []
+    told: list[str] = []
+    too_bright: list[Recording] = []
+    for group in groups:
+        if group[0].kind == "dark":
+            out.append(group)
+            continue
+        mean_dn, saturated = thinned(group, white_level)
+        lit = [recording for recording, at_white in zip(group, saturated, strict=True) if not at_white]
+        too_bright += [recording for recording, at_white in zip(group, saturated, strict=True) if at_white]
+        levels = _levels_of(lit, mean_dn[~saturated] - black_dn)
+        if len(levels) > 1:
+            low, high = mean_dn[~saturated].min(), mean_dn[~saturated].max()
+            name = f"{len(lit)} flats of {group[0].exposure_s:g} s"
+            told.append(f"{name} were taken as {len(levels)} levels of light, {low:.0f} to {high:.0f} DN")
+        out += levels
+    if too_bright:
+        seconds = sorted(recording.exposure_s for recording in too_bright)
+        name = f"{len(seconds)} flats of {' to '.join(f'{t:g}' for t in sorted({seconds[0], seconds[-1]}))} s"
+        told.append(f"{name} were set aside: most of their pixels are saturated")
+    return out, told
+
+
+def thinned(group: Sequence[Recording], white_level: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Of the first frame of each recording: mean, DN, and whether most pixels are saturated."""
+
+    def of(recording: Recording) -> tuple[float, bool]:
+        some = np.asarray(recording.counts[0])[::THIN, ::THIN]
+        # A frame of one count throughout is at white, whether the file says where that is or not.
+        white = some.max() if some.min() == some.max() else np.inf if white_level is None else white_level
+        return float(some.mean()), bool(np.mean(some >= white) > SATURATED)
+
+    with ThreadPoolExecutor(READERS) as pool:
+        means, saturated = zip(*pool.map(of, group), strict=True)
+    return np.array(means), np.array(saturated, bool)
+
+
+def _levels_of(group: Sequence[Recording], signal_dn: np.ndarray) -> Groups:
+    """By filter and light, and by folder, too, where each folder holds several frames of its level."""
+    by_folder = _split(group, signal_dn, lambda r: (r.filter_name or "", str(r.path.parent)))
+    if all(sum(r.n_frames for r in level) > 1 for level in by_folder):
+        return by_folder
+    return _split(group, signal_dn, lambda r: (r.filter_name or "",))
+
+
+def _split(group: Sequence[Recording], signal_dn: np.ndarray, key: Callable[[Recording], Any]) -> Groups:
+    levels: Groups = []
+    last = None
+    for i in sorted(range(len(group)), key=lambda i: (key(group[i]), signal_dn[i])):
+        within = last is not None and key(group[i]) == last[0]
+        if not within or signal_dn[i] - last[1] > max(SAME_LIGHT * last[1], STEADY_DN):
+            levels.append([])
+            last = key(group[i]), signal_dn[i]
+        levels[-1].append(group[i])
+    order = {id(recording): i for i, recording in enumerate(group)}
+    return [sorted(level, key=lambda recording: order[id(recording)]) for level in levels]

@@ -1,0 +1,66 @@
+"""NumPy files: .npy memory-mapped, .npz loaded whole."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hsnoise.frames.io._recording import Recording, naming, recordings
+
+EXPOSURE_FROM = "'exposure_s' in an .npz file"
+
+
+def read(path: Path) -> list[Recording]:
+    """Counts `[row, column]`, `[frame, row, column]` or `[exposure, frame, row, column]` of a NumPy file.
+
+    An .npy file is memory-mapped. An .npz file is compressed, so it is loaded whole; it holds `counts`, and
+    may hold exposure_s, kind, black_level, white_level, cfa, shutter, iso and temperature_c. An .npz file of several
+    arrays `[frame, row, column]` is read with the .json file beside it, in which `arrays` gives each its `kind` and
+    `exposure_s`.
+
+    Raises:
+        ValueError: unreadable, truncated, or without counts of such a shape.
+    """
+    with naming(path):
+        if path.suffix.lower() == ".npy":
+            return recordings(path, _groups(np.load(path, mmap_mode="r")), {})
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no .npz file, or one that was cut off")
+        with path.open("rb") as file, np.load(file) as arrays:
+            if "counts" not in arrays and path.with_suffix(".json").is_file():
+                return _described(path, arrays)
+            if "counts" not in arrays:
+                raise ValueError(f"expected an array 'counts', got {sorted(arrays)}")
+            return recordings(path, _groups(arrays["counts"]), arrays)
+
+
+def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
+    """Recordings of named arrays, by what the .json file beside them says of each."""
+    about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    found = []
+    for name, one in about["arrays"].items():
+        kind = str(one["kind"]).split()[0].lower()
+        metadata: dict[str, Any] = {"exposure_s": float(one["exposure_s"]), "kind": "dark" if kind == "bias" else kind}
+        if about.get("cfa"):
+            metadata["cfa"] = about["cfa"].split()[0]
+        temperatures = np.asarray(one.get("sensor_temp_c") or [], float)
+        if np.isfinite(temperatures).any():
+            metadata["temperature_c"] = float(np.nanmean(temperatures))
+        found += recordings(path, _groups(arrays[name]), metadata)
+    return found
+
+
+def _groups(counts: np.ndarray) -> list[np.ndarray]:
+    if counts.ndim not in (2, 3, 4):
+        raise ValueError(
+            "expected counts [row, column], [frame, row, column] or [exposure, frame, row, column], "
+            f"got shape {counts.shape}"
+        )
+    if counts.ndim == 4:
+        return list(counts)
+    return [counts if counts.ndim == 3 else counts[np.newaxis]]

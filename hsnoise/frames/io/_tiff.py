@@ -1,0 +1,109 @@
+"""TIFF files with one raw frame a page, by tifffile."""
+
+from __future__ import annotations
+
+import struct
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+
+from hsnoise._core.types import BAYER_CFAS
+from hsnoise.frames.io._recording import UNKNOWN_ORDER, Recording, lazy_frames, naming
+from hsnoise.frames.lazy import LazyFrames
+
+EXPOSURE_FROM = "EXIF ExposureTime"
+_CFA_PHOTOMETRIC = 32803
+
+
+def read(path: Path) -> list[Recording]:
+    """The pages of a TIFF file as frames, those of one exposure and ISO together; Bayer order from the first page.
+
+    Raises:
+        ValueError: unreadable, truncated, colour pages, pages of several sizes, an exposure or ISO that is none.
+    """
+    with naming(path), tifffile.TiffFile(path) as file:
+        pages = [page for page in file.pages if not page.is_reduced]  # reduced: a thumbnail
+        sizes = {page.shape for page in pages}
+        if len(sizes) != 1 or len(pages[0].shape) != 2:
+            raise ValueError(f"expected pages [row, column] of one size, got {sorted(sizes)}")
+        end, size = max(_next_page(file), *map(_end, pages)), path.stat().st_size
+        if end > size:
+            raise ValueError(f"truncated: {size} bytes, its tags promise {end}")
+        first = _tags(pages[0])
+        groups: dict[tuple[float | None, float | None], list[int]] = {}
+        for page in pages:
+            tags = first | _tags(page)  # what a page does not say is as on the first
+            groups.setdefault((_exposure_s(tags), _iso(tags)), []).append(page.offset)
+        return [
+            Recording(
+                path=path,
+                counts=_frames(path, places, pages[0]),
+                exposure_s=exposure_s,
+                iso=iso,
+                cfa=_cfa(pages[0], first),
+            )
+            for (exposure_s, iso), places in groups.items()
+        ]
+
+
+def _frames(path: Path, places: list[int], page: Any) -> LazyFrames:
+    return lazy_frames(path, partial(_read_frame, places=tuple(places)), len(places), page.shape, page.dtype)
+
+
+def _read_frame(path: Path, index: int, *, places: tuple[int, ...]) -> np.ndarray:
+    """The page whose directory lies at `places[index]`: to walk through all before it would take quadratic time."""
+    with tifffile.TiffFile(path) as file:
+        file.filehandle.seek(places[index])
+        return tifffile.TiffPage(file, index).asarray()
+
+
+def _next_page(file: tifffile.TiffFile) -> int:
+    """Where a page that tifffile passed over for lying outside the file should begin; 0: none such."""
+    file.filehandle.seek(file.pages.next_page_offset)
+    return struct.unpack(file.tiff.offsetformat, file.filehandle.read(file.tiff.offsetsize))[0]
+
+
+def _end(page: Any) -> int:
+    """Where the page's last segment ends in the file, bytes."""
+    segments = zip(page.dataoffsets, page.databytecounts, strict=True)
+    return max((offset + length for offset, length in segments), default=0)
+
+
+def _tags(page: Any) -> dict[str, Any]:
+    """Tags by name, those of the EXIF directory too."""
+    tags = {tag.name: tag.value for tag in page.tags.values()}
+    return tags | tags.get("ExifTag", {})
+
+
+def _exposure_s(tags: dict[str, Any]) -> float | None:
+    """The exposure, a rational: a pair of whole numbers."""
+    value = tags.get("ExposureTime")
+    if value is None:
+        return None
+    if not isinstance(value, tuple):
+        return float(value)
+    if len(value) != 2 or not value[1]:
+        raise ValueError(f"ExposureTime: expected one rational number of seconds, got {value}")
+    return float(value[0] / value[1])
+
+
+def _iso(tags: dict[str, Any]) -> float | None:
+    """The ISO; 0 stands for unknown. Some cameras write it twice."""
+    value = tags.get("ISOSpeedRatings", tags.get("PhotographicSensitivity"))
+    numbers = set(value) if isinstance(value, tuple) else {value}
+    if len(numbers) > 1:
+        raise ValueError(f"ISOSpeedRatings: expected one number, got {value}")
+    (one,) = numbers
+    return float(one) if one else None
+
+
+def _cfa(page: Any, tags: dict[str, Any]) -> str | None:
+    if page.photometric != _CFA_PHOTOMETRIC:
+        return None
+    pattern = tags.get("CFAPattern", ())
+    codes = pattern if isinstance(pattern, bytes | tuple) else ()
+    cfa = "".join("RGB"[code] for code in codes if code < 3)
+    return cfa if cfa in BAYER_CFAS else UNKNOWN_ORDER

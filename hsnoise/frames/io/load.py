@@ -1,0 +1,71 @@
+"""Read captures: camera raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files to a `FrameStack`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from hsnoise._core.arguments import one_of
+from hsnoise.frames.io._capture import read_capture
+from hsnoise.frames.stack import FrameStack
+
+
+def load(
+    path: Any,
+    *,
+    exposure_s: Any = None,
+    kind: str | Sequence[str] | None = None,
+    cfa: str | None = None,
+    black_level: Any = None,
+    white_level: float | None = None,
+    shutter: str | None = None,
+    row_axis: int = 0,
+    roi: tuple[Any, Any] | None = None,
+    overscan: str | tuple[Any, Any] | None = None,
+    progress: bool = True,
+) -> FrameStack:
+    """Read a capture: dark frames, flat frames or both, of one camera at one gain setting.
+
+    Only headers are read now, and of flats one frame a file; frames are read one at a time when the stack is iterated
+    (.npz files are loaded whole). Frames of one kind whose exposures agree to 1e-3 form a group; darks first, short
+    before long; flats of one exposure whose light differs by more than 5 % form several.
+    What is given here overrides what the files say; a warning tells of exposures that differ.
+
+    Frames that do not belong with the others (lights, masters, another format, size, binning, gain, ISO or temperature)
+    are set aside, and flats of another crop go to `elsewhere`; `assumed` of the stack tells of all this.
+
+    Args:
+        path: a folder, a glob pattern, one file, or a list of files and folders. A folder's files and those of the
+            folders in it are taken in natural order (frame2 before frame10), files of no known format are passed over.
+            A folder with EMVA1288_Data.txt is read as that says.
+        exposure_s: exposure time, s; one for all, or one a file (one an exposure for a file of several).
+        kind: "dark" or "flat", likewise. None: what the files say, or else their names and those of their folders
+            (bias, zero, dark, flat, darkflat, ...), or else "dark".
+        cfa: "mono" or the Bayer order of the first stored pixel. None: what the files say, or "mono".
+        black_level, white_level: DN; black one value or one a channel. None: what the files say; if they say
+            nothing, black is to be estimated and white unknown.
+        shutter: "rolling" or "global". None: what the files say, or "rolling".
+        row_axis: axis of a stored frame that counts sensor rows; 1 for frames stored in portrait.
+        roi: ((first row, end row), (first column, end column)) in sensor coordinates, ends excluded; either
+            may be None. Odd starts rotate `cfa`.
+        overscan: "auto" takes off rows or columns at the edges that do not follow the light of flats, or that the
+            headers name, and keeps their means in `overscan_dn`; ((first row, end row), (first column, end column)),
+            one of them None, takes off these; None names what is found.
+        progress: show a bar on long reads.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: an unreadable file, no exposure time, or frames that do not belong together and of which
+            neither are the most; the message names the file. Also whatever `FrameStack` refuses.
+    """
+    options = {"cfa": cfa, "black_level": black_level, "white_level": white_level, "shutter": shutter}
+    return read_capture(
+        path,
+        exposure_s=exposure_s,
+        kind=kind,
+        overscan=overscan,
+        progress=progress,
+        roi=roi,
+        row_axis=one_of("row_axis", row_axis, (0, 1)),
+        **options,
+    )

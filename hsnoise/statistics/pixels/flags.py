@@ -1,0 +1,81 @@
+"""Pixels that are no noise: stuck, dead, hot, telegraph-like; told by what they do over time."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from hsnoise.statistics.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.statistics.pixels.survey import Survey
+
+FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
+DIM = 0.5  # of the median response to light: below it a pixel is dead
+RARE = 1e-3  # chance of a variance so high, in each half of the frames
+
+
+def flags_of(found: Survey, channel: int) -> np.ndarray:
+    """Bits of FLAGS of each sampled pixel of one channel [pixel]; those that the frames do not tell are not set."""
+    halves = [[p.halves for p in g.of(channel)] for g in found.groups if g.n_frames > 1]
+    if not halves or halves[0][0] is None:
+        return np.zeros(0, np.uint8)
+    flags = np.zeros(sum(h.level_dn.shape[1] for h in halves[0]), np.uint8)
+    stuck = found.stuck(channel)
+    flags[stuck] |= FLAGS["stuck"]
+    lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
+    if lit:
+        flags[_dead(found, channel)] |= FLAGS["dead"]
+    pixels = levels_of(found, channel)
+    if pixels is not None:
+        growth = slope_over(pixels.exposure_s, pixels.level)
+        moving = np.flatnonzero(~stuck)
+        flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
+    dark = [[p.halves for p in g.of(channel)] for g in found.repeated_darks]
+    flags[_jumping(dark, len(flags)) & ~stuck] |= FLAGS["telegraph"]
+    return flags
+
+
+def counts_of(flags: np.ndarray) -> dict[str, float]:
+    """Share of the pixels with each flag."""
+    return {name: float(np.mean(flags & bit > 0)) if flags.size else float("nan") for name, bit in FLAGS.items()}
+
+
+def _dead(found: Survey, channel: int) -> np.ndarray:
+    """Pixels that hardly answer to light."""
+    flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
+    level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.of(channel)]) for g in flats]
+    bright = int(np.argmax([np.median(x) for x in level]))
+    darks = found.repeated_darks
+    black = np.zeros_like(level[bright])
+    if darks:
+        black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].of(channel)])
+    signal = level[bright] - black
+    return signal < DIM * np.median(signal)
+
+
+def _jumping(halves, pixels: int) -> np.ndarray:
+    """Pixels whose variance is far above that of pixels of their level in both halves of the frames of an exposure."""
+    found = np.zeros(pixels, bool)
+    for of in halves:
+        dof = np.array(of[0].n_frames) - 1
+        if dof.min() < 1:
+            continue
+        variance = np.concatenate([h.variance_dn2 for h in of], 1)
+        level = np.concatenate([h.level_dn for h in of], 1).mean(0)
+        expected = _of_their_level(level, np.concatenate([h.pair_variance_dn2 for h in of]))
+        limit = chi2.isf(RARE, dof) / dof
+        found |= (variance / np.maximum(expected, 0.25) > limit[:, None]).all(0)
+    return found
+
+
+def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Typical variance of pixels of about the same level [pixel]: mean below the 90 % quantile, by level."""
+    edges = np.unique(np.quantile(level, np.concatenate([[0, 0.5, 0.9], 1 - np.geomspace(0.05, 1e-4, 10)])))
+    number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, len(edges) - 1)
+    typical = np.empty(len(edges))
+    for i in range(len(edges)):
+        inside = variance[number == i]
+        typical[i] = np.minimum(inside, np.quantile(inside, 0.9)).mean() if inside.size > 20 else np.nan
+    known = np.flatnonzero(np.isfinite(typical))
+    if not known.size:
+        return np.full(len(level), np.median(variance))
+    return np.interp(np.arange(len(edges)), known, typical[known])[number]

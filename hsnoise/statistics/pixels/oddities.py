@@ -1,0 +1,136 @@
+"""Frames, lines and pixels of a capture that are no measurement of the sensor's noise, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hsnoise.statistics.pixels.flags import counts_of, flags_of
+from hsnoise.statistics.pixels.survey import Group, Survey
+
+ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by which its noise differs from the others'
+LEAST_LEVEL_DN = 0.5
+MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that are worth a sentence
+QUIET = 0.05  # of the other colours' noise: a colour that is dead
+LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel's noise
+LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # of that signal over pixels: less is simulated, more is dark current
+SMOOTHED = 0.1  # of the noise, that neighbouring pixels share
+FEWEST = 3  # frames, of which one can be told to be odd
+
+
+def oddities_of(found: Survey) -> tuple[str, ...]:
+    """What is wrong with frames, lines and colours, most important first."""
+    return (*_frames(found), *_lines(found), *_colours(found), *_smoothed(found))
+
+
+def name_of(group: Group) -> str:
+    return f"{group.kind} frames of {group.exposure_s:g} s"
+
+
+def _frames(found: Survey) -> Iterator[str]:
+    for group in found.groups:
+        if group.n_frames < FEWEST:
+            continue
+        level = np.mean([p.halves.frame_means_dn for p in group.planes], axis=0)
+        noise = np.mean([p.halves.frame_noise_dn for p in group.planes], axis=0)
+        off = level - np.median(level)
+        scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
+        pixel = float(np.median(noise))
+        lit = group.kind == "flat"  # flicker is taken off flats
+        for f in () if lit else np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
+            side = "brighter" if off[f] > 0 else "darker"
+            yield (
+                f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or of"
+                " another exposure or temperature? Leave it out."
+            )
+        for f in np.flatnonzero(noise < (1 - ODD_NOISE) * pixel):
+            yield (
+                f"Frame {f} of the {name_of(group)} has {1 - noise[f] / pixel:.0%} less noise than the others: is it an"
+                " average of frames (a masterdark)? Leave it out."
+            )
+
+
+def _lines(found: Survey) -> Iterator[str]:
+    for group in found.groups[:1]:
+        odd = group.odd_lines
+        if any(p.narrow_dn is not None for p in group.planes):
+            return  # lines of one count are no wonder
+        for what, lines in (("rows", odd.constant_rows), ("columns", odd.constant_columns)):
+            if len(lines):
+                yield f"{_listed(what, lines)} have one count throughout: they are dead, or padding. Crop them (roi)."
+        if len(odd.repeated_rows):
+            yield f"{_listed('rows', odd.repeated_rows)} repeat the row before: they are padding. Crop them (roi)."
+
+
+def _listed(what: str, lines: np.ndarray) -> str:
+    shown = ", ".join(str(n) for n in lines[:5])
+    return f"{len(lines)} {what} ({shown}{', ...' if len(lines) > 5 else ''})"
+
+
+def _colours(found: Survey) -> Iterator[str]:
+    """Colours without noise."""
+    if len(found.channels) == 1:
+        return
+    for group in found.darks[:1]:
+        noise = [
+            np.mean([p.components["temporal"].variance_dn2 for p in group.of(c)]) for c in range(len(found.channels))
+        ]
+        for c, name in enumerate(found.channels):
+            if noise[c] < QUIET**2 * np.nanmax(noise):
+                yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
+
+
+def _smoothed(found: Survey) -> Iterator[str]:
+    """Noise that neighbours share: a pixel's variance is then no measure of its electrons."""
+    # Darks only: light that differs between two flats brings their pattern into what changes.
+    planes = [(plane.neighbours_share, group) for group in found.repeated_darks for plane in group.planes]
+    wide = [one for one in planes if one[1].noise_dn > LEAST_LEVEL_DN]
+    share, group = max(wide, key=lambda one: one[0], default=(0.0, None))
+    if group is not None and share > SMOOTHED:
+        yield (
+            f"Neighbouring pixels of a row share {share:.0%} of their noise ({name_of(group)}): the frames were"
+            " smoothed, denoised, resized or demosaiced, or the readout is slow. Gain and noise come out too small."
+        )
+
+
+def lit_darks(found: Survey) -> Iterator[str]:
+    """Darks whose pixels rise nearly alike, as light makes them; dark currents differ by far more."""
+    first = found.shortest
+    for c, channel in enumerate(found.channels if first is not None else ()):
+        of = "" if channel == "mono" else f" of channel {channel}"
+        unlit = _levels(first, c)
+        for group in found.repeated_darks:
+            signal = _levels(group, c) - unlit
+            rise = float(np.median(signal))
+            a, b = (one - np.median(one) for one in signal)
+            width = float(np.quantile(np.abs(a + b) / 2, 0.99))
+            common = float(np.mean(np.clip(a, -width, width) * np.clip(b, -width, width)))
+            spread = np.sqrt(max(common, 0.0)) / max(rise, 1e-9)
+            if rise > max(LIT_DN, LIT_NOISES * group.noise_dn) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
+                yield (
+                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN and differ in that by {spread:.2g}"
+                    " of it: dark currents differ by more. Did light get in, or are they flats (kind='flat')?"
+                )
+                break
+
+
+def _levels(group: Group, c: int) -> np.ndarray:
+    """Level of each pixel of a channel in two halves of the frames [half, pixel], DN."""
+    return np.concatenate([p.halves.level_dn for p in group.of(c)], 1).astype(np.float64)
+
+
+def pixels_apart(found: Survey) -> Iterator[str]:
+    """Shares of pixels that are no noise: stuck, dead, telegraph-like."""
+    for c, channel in enumerate(found.channels):
+        shares = counts_of(flags_of(found, c))
+        of = "" if channel == "mono" else f" of channel {channel}"
+        if shares["stuck"] > MANY["stuck"]:
+            yield f"{100 * shares['stuck']:.2g} % of the pixels{of} never change: they are stuck, and are no noise."
+        if shares["telegraph"] > MANY["telegraph"]:
+            yield (
+                f"{100 * shares['telegraph']:.2g} % of the pixels{of} are far noisier than others of their level"
+                " (telegraph-like)."
+            )
+        if shares["dead"] > MANY["stuck"]:
+            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly answer to light: they are dead, or overscan."

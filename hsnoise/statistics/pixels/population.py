@@ -1,0 +1,240 @@
+"""How pixels differ: the distribution of dark current and of offsets over pixels, the noise of estimation taken off.
+
+Dark current is modelled as the effects that draw it: log-normal, and in a fraction of hot pixels an exponential extra
+(`dark_current_nonuniformity`, `hot_pixels`), fitted to the measured growth of all pixels by maximum likelihood; the
+known noise of a pixel's growth is part of the distribution. Offsets are normal, from the covariance of two halves of
+the frames, which noise does not enter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import erfcx, ndtr
+
+from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
+
+NODES = 48  # of the log-normal distribution, or of the noise where that is the narrower one
+WIDE = 0.5  # of the log-normal width: noise from which on it is the wider one
+CORE_BINS, TAIL_BINS = 120, 80
+APART_SIGMAS, APART_SHARE = 6.0, 0.3  # growth in two halves that disagrees by more is a hit or a jump, not a growth
+SIGNIFICANT = 15.0  # twice the gain in log-likelihood from which pixels differ in dark current
+LEAST_SPREAD = 0.02
+WINSOR_SIGMAS = 5.0
+MOST_HOT = 0.3
+FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames, too
+
+
+@dataclass(frozen=True)
+class Population:
+    """Dark current of the pixels of one channel, DN/s, and offsets, DN; each value with its standard error.
+
+    Attributes:
+        mean: of ordinary pixels, whatever the limit at which others are called hot.
+        spread: of ln dark current of ordinary pixels (0: they do not differ).
+        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current:
+            with it the mean over all pixels is the measured one.
+        at_readout: extra charge of hot pixels whatever the exposure, mean, DN.
+        offset_sigma: standard deviation of offsets over pixels, rows and columns taken off.
+        median, quantiles: of the measured growth, DN/s; quantiles at 1, 16, 84, 99, 99.9 %.
+        noise: standard deviation by chance of the growth of one pixel, DN/s.
+    """
+
+    mean: float
+    spread: tuple[float, float]
+    hot_fraction: tuple[float, float]
+    hot_rate: tuple[float, float]
+    at_readout: tuple[float, float]
+    offset_sigma: tuple[float, float]
+    median: float
+    quantiles: tuple[float, ...]
+    noise: float
+
+
+def population_of(
+    pixels: Levels, limit: float, ordinary: float, pedestal_dn_per_s: float, pattern: np.ndarray, low_side_dn: float
+) -> Population:
+    """The population of one channel.
+
+    Args:
+        pixels: of `levels_of`.
+        limit: growth from which on pixels were called hot, DN/s; ordinary: mean growth of those below it, pedestals
+            taken off.
+        pedestal_dn_per_s: what moving pedestals add to every pixel's growth.
+        pattern [half, pixel]: offset of each pixel less its row and column, DN, at the shortest exposure.
+        low_side_dn: standard deviation of offsets as pixels below the median show it.
+    """
+    halves = slope_over(pixels.exposure_s, pixels.level) - pedestal_dn_per_s
+    noise = growth_noise(halves) / np.sqrt(2)
+    growth = halves.mean(0)
+    apart = np.abs(halves[0] - halves[1])
+    steady = (apart < APART_SIGMAS * 2 * noise) | (apart < APART_SHARE * 2 * np.abs(growth))
+    growth = growth[steady].astype(np.float64)
+    # A pedestal that falls by more than dark signal rises is common to all pixels: they are measured from there.
+    fallen = min(float(np.median(growth)), 0.0)
+    values, errors = _fitted(growth - fallen, noise)
+    if not _hot_again(halves, limit - pedestal_dn_per_s):
+        values[2:], errors[2:] = 0.0, np.inf
+    body, spread, fraction, rate = values
+    # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
+    cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
+    beyond = body - cut if spread > 0 or fraction > 0 else 0.0
+    mean = ordinary + beyond
+    if fraction > 0:  # whatever the shape of the tail, its charge is kept; moving pedestals are in both means
+        total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
+        measured = float(growth[growth < limit - pedestal_dn_per_s].mean()) + beyond
+        rate = max((total - measured) / fraction, 0.0)
+        errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
+    shortest = float(pixels.exposure_s.min())
+    return Population(
+        mean=mean,
+        spread=(spread, errors[1]),
+        hot_fraction=(fraction, errors[2]),
+        hot_rate=(rate, errors[3]),
+        at_readout=_at_readout(pixels, halves, noise, rate),
+        offset_sigma=offset_sigma(pattern, spread * body * shortest, low_side_dn),
+        median=float(np.median(growth)),
+        quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
+        noise=float(noise),
+    )
+
+
+def _hot_again(halves: np.ndarray, limit: float) -> bool:
+    """Whether pixels that are hot in one half of the frames are so in the other: jumps and hits are not."""
+    once = halves[0] > limit
+    return bool(once.sum() > FEWEST_HOT and np.mean(halves[1][once] > limit / 2) > HOT_AGAIN)
+
+
+def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
+    """Mean measured growth of the pixels below a limit, under the fitted distribution."""
+    x = np.linspace(min(-8 * noise, limit - 1e-9), limit, 400)
+    cdf = growth_cdf(x, noise, *values)
+    return float(limit - np.trapezoid(cdf, x) / max(cdf[-1], 1e-12))
+
+
+def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
+    """Share of pixels whose measured growth is below x: log-normal, in a fraction plus exponential, plus noise."""
+    z, weight = np.polynomial.hermite_e.hermegauss(NODES)
+    weight = weight / weight.sum()
+    body = mean * np.exp(spread * z - spread**2 / 2)
+    off = (x[:, None] - body) / noise
+    if noise > WIDE * spread * mean:
+        plain = ndtr(off) @ weight
+    else:  # between nodes of the log-normal distribution, narrow noise would leave steps
+        left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
+        plain = ndtr(np.log(left) / spread + spread / 2) @ weight
+    if fraction > 0:
+        warm = (ndtr(off) - _exponential_share(off, noise / rate)) @ weight
+        plain = (1 - fraction) * plain + fraction * warm
+    return plain
+
+
+def _exponential_share(off: np.ndarray, ratio: float) -> np.ndarray:
+    """By how much an exponential extra of noise over `ratio` lowers the normal distribution function at `off`."""
+    # exp(ratio^2 / 2 - ratio off) ndtr(off - ratio), without overflow.
+    inner = (ratio - off) / np.sqrt(2)
+    low = 0.5 * np.exp(-0.5 * off**2) * erfcx(np.maximum(inner, -25.0))
+    return np.where(inner > -25.0, low, np.exp(np.minimum(ratio**2 / 2 - ratio * off, 0.0)))
+
+
+def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """(mean, spread, fraction, rate) of the growth [pixel], and standard errors; zeros for what is not significant."""
+    middle = float(np.median(growth))
+    core = 1.4826 * float(np.median(np.abs(growth - middle)))
+    if core <= 0:
+        return np.array([max(middle, 0.0), 0.0, 0.0, 0.0]), np.full(4, np.inf)
+    far = max(growth.max() - middle, 12 * core)
+    edges = middle + np.append(np.linspace(-6 * core, 6 * core, CORE_BINS), np.geomspace(6.2 * core, far, TAIL_BINS))
+    counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
+
+    def natural(theta: np.ndarray) -> tuple[float, float, float, float]:
+        if middle <= 0:  # no dark current of ordinary pixels, which could differ
+            theta = np.array([0.0, np.log(1e-3), *theta[2:]])
+        return _natural(theta, core)
+
+    def loss(theta: np.ndarray) -> float:
+        cdf = growth_cdf(edges, noise, *natural(theta))
+        return -float(counts @ np.log(np.maximum(np.diff(np.concatenate([[0.0], cdf, [1.0]])), 1e-12)))
+
+    excess = growth[growth > middle + 6 * core] - middle
+    rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
+    share = float(np.clip(len(excess) / len(growth), 1e-5, 0.1))
+    theta = np.array([middle / core, np.log(0.2), np.log(share / (MOST_HOT - share)), np.log(rate / core)])
+    for _ in range(2):
+        theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
+    values = np.array(natural(theta))
+    units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3]])
+    errors = _errors(loss, theta) * units
+    alike, cool = theta.copy(), theta.copy()
+    alike[1], cool[2] = np.log(1e-3), -25.0
+    if values[1] < LEAST_SPREAD or 2 * (_refit(loss, alike, 1) - loss(theta)) < SIGNIFICANT:
+        values[1], errors[1] = 0.0, max(values[1], errors[1])
+    if len(excess) < 10 or 2 * (_refit(loss, cool, 2) - loss(theta)) < SIGNIFICANT:
+        values[2:], errors[2:] = 0.0, np.inf
+    return values, errors
+
+
+def _natural(theta: np.ndarray, core: float) -> tuple[float, float, float, float]:
+    """Mean, spread, fraction and rate from unconstrained numbers in units of the core's width."""
+    fraction = MOST_HOT / (1 + np.exp(-np.clip(theta[2], -40, 40)))
+    rate = core * float(np.exp(np.clip(theta[3], -12, 12)))
+    return core * max(float(theta[0]), 1e-3), float(np.exp(np.clip(theta[1], -12, 1.2))), float(fraction), rate
+
+
+def _refit(loss, theta: np.ndarray, held: int) -> float:
+    """Least loss with one number held."""
+    free = [i for i in range(len(theta)) if i != held]
+
+    def partial(some: np.ndarray) -> float:
+        whole = theta.copy()
+        whole[free] = some
+        return loss(whole)
+
+    return float(minimize(partial, theta[free], method="Nelder-Mead", options={"maxiter": 400, "fatol": 0.05}).fun)
+
+
+def _errors(loss, theta: np.ndarray) -> np.ndarray:
+    """Standard errors from the curvature of the loss; infinite where it has none."""
+    n, step = len(theta), 0.02
+    hessian = np.empty((n, n))
+    unit = step * np.eye(n)
+    for i in range(n):
+        for j in range(i, n):
+            parts = [loss(theta + a * unit[i] + b * unit[j]) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+            hessian[i, j] = hessian[j, i] = (parts[0] - parts[1] - parts[2] + parts[3]) / (4 * step**2)
+    values, vectors = np.linalg.eigh(hessian)
+    variance = (vectors**2 / np.maximum(values, 1e-9)) @ np.ones(n)
+    return np.sqrt(np.minimum(variance, 1e6))
+
+
+def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
+    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off.
+
+    At most that of the pixels below the median: warm pixels are no normal offsets.
+    """
+    width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
+    a, b = np.clip(pattern, -width, width).astype(np.float64)
+    product = (a - a.mean()) * (b - b.mean())
+    both = min(float(product.mean()), low_side_dn**2)
+    variance, error = both - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
+    sigma = np.sqrt(max(variance, 0.0))
+    return float(sigma), float(min(error / max(2 * sigma, 1e-12), np.sqrt(error)))
+
+
+def _at_readout(pixels: Levels, halves: np.ndarray, noise: float, rate: float) -> tuple[float, float]:
+    """Extra offset of the hottest pixels, in proportion to their growth, times the mean rate; with its error, DN."""
+    if rate <= 0:
+        return 0.0, np.inf
+    median = np.median(halves)
+    hot = halves[0] > median + max(0.5 * rate, 8 * noise)  # chosen in one half, measured in the other
+    if hot.sum() < 20:
+        return 0.0, np.inf
+    t = pixels.exposure_s
+    offset = pixels.level[:, 1].mean(0) - halves[1] * t.mean()
+    growth = halves[1][hot].astype(np.float64) - median
+    extra = offset[hot].astype(np.float64) - np.median(offset)
+    ratio = float(np.median(extra / growth))
+    scatter = 1.4826 * float(np.median(np.abs(extra / growth - ratio))) / np.sqrt(len(growth))
+    return (ratio * rate, scatter * rate) if ratio > 3 * scatter else (0.0, scatter * rate)

@@ -1,0 +1,183 @@
+"""Whether pixels differ: static structure of single pixels, beside rows, columns and smooth shading."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from hsnoise.statistics.pixels.classes import HOT_SIGMAS
+from hsnoise.statistics.pixels.sample import covariance_of
+from hsnoise.statistics.pixels.survey import Group, Survey
+
+WINSOR_SIGMAS = 5.0
+SIGNIFICANT = 5.0  # standard errors
+SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+GROWN = 0.1  # of the variance of the shortest exposure
+HITS = 10.0  # temporal variance of all pixels over that of the typical one
+SMALL_PATTERN = 0.001  # of the temporal variance
+MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
+STREAKS = 0.05  # growth of the variance of row means over that of pixels from which streaks rule the noise
+CLIPPED = 0.6  # share of clipped counts from which the moments of pixels over time say too little of the noise
+
+
+class Static(NamedTuple):
+    """Static variance of single pixels and its standard error, DN^2; temporal variance, DN^2."""
+
+    variance_dn2: float
+    error_dn2: float
+    temporal_dn2: float
+
+
+def static_of(found: Survey, group: Group, channel: int) -> Static | None:
+    """The static variance of the pixels of one channel in one exposure; None where halves of the frames do not tell."""
+    planes = group.of(channel)
+    if group.n_frames < 2:
+        return None
+    products, temporal = [], []
+    for plane in planes:
+        pattern = double_differences(plane.halves.level_dn, len(found.sampled_rows) * plane_rows(found))
+        products.append(covariance_terms(pattern))
+        temporal.append(float(np.median(plane.halves.pair_variance_dn2)))
+    terms = np.concatenate(products)
+    noise = np.mean([p.components["temporal"].variance_dn2 for p in planes])
+    return Static(float(terms.mean()), float(terms.std() / np.sqrt(len(terms))), float(noise))
+
+
+def plane_rows(found: Survey) -> float:
+    """Rows of a plane for each sampled row of the sensor."""
+    return 1.0 if found.cfa == "mono" else 0.5
+
+
+def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
+    """What pixels of blocks of 2 x 2 differ by beyond rows and columns [half, block], with the variance of a pixel.
+
+    level [half, pixel]: of `rows` rows. Smooth shading, row and column patterns cancel.
+    """
+    maps = level.reshape(2, int(rows), -1)
+    height, width = (size // 2 * 2 for size in maps.shape[1:])
+    a, b = maps[:, 0:height:2, :width], maps[:, 1:height:2, :width]
+    block = (a - b)[..., 0::2] - (a - b)[..., 1::2]
+    return block.reshape(2, -1) / np.float32(2)
+
+
+def low_side_sigma(level: np.ndarray, rows: float) -> float:
+    """Standard deviation of the offsets of pixels [half, pixel] as those below the median show it, DN.
+
+    Warm pixels stand above it only; row and column medians are taken off, the noise of estimation by the two halves.
+    """
+    maps = level.reshape(2, int(rows), -1).astype(np.float64)
+    mean = maps.mean(0)
+    mean = mean - np.median(mean, axis=0, keepdims=True)
+    mean = mean - np.median(mean, axis=1, keepdims=True)
+    apart = (maps[0] - maps[1]) / 2
+    low, middle = np.quantile(mean, (0.1587, 0.5))
+    low_noise, high_noise = np.quantile(apart, (0.1587, 0.8413))
+    return float(np.sqrt(max((middle - low) ** 2 - ((high_noise - low_noise) / 2) ** 2, 0.0)))
+
+
+def covariance_terms(pattern: np.ndarray) -> np.ndarray:
+    """Products of two halves [half, place], winsorised, whose mean is the variance of what both share."""
+    width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
+    a, b = np.clip(pattern, -width, width).astype(np.float64)
+    return (a - a.mean()) * (b - b.mean())
+
+
+def pixels_differ(found: Survey) -> bool:
+    """Whether static structure of single pixels is significant, and large beside what changes from frame to frame."""
+    for c in range(len(found.channels)):
+        for group in found.darks:
+            one = static_of(found, group, c)
+            if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
+                return True
+        if _always_bright(found, c) > MANY_HOT:
+            return True
+    return False
+
+
+def variance_grows(found: Survey) -> bool:
+    """Whether the temporal variance of the typical pixel grows with exposure beyond chance, in some colour."""
+    groups = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
+    for c in range(len(found.channels)):
+        ends = []
+        for group in (groups[0], groups[-1]):
+            variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)])
+            middle = float(np.median(variance))
+            width = 1.4826 * float(np.median(np.abs(variance - middle)))
+            # Of few frames the median lies below the mean, by the same factor in all pixels.
+            share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
+            ends.append((middle / share, 1.25 * width / share / np.sqrt(len(variance))))
+        (low, low_error), (high, high_error) = ends
+        if high - low > max(SIGNIFICANT * np.hypot(low_error, high_error), GROWN * low):
+            return True
+    return False
+
+
+def full_of_hits(found: Survey) -> bool:
+    """Whether what changes is mostly hits in a few pixels: a likelihood with a share of outliers does better then."""
+    planes = [p for g in found.darks if g.n_frames > 1 for p in g.planes]
+    typical = [float(np.median(p.halves.pair_variance_dn2)) for p in planes]
+    changing = [p.components["temporal"].variance_dn2 for p in planes]
+    return any(all_of > HITS * max(of, 1e-6) for all_of, of in zip(changing, typical, strict=True))
+
+
+def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
+    """Two dark exposures in order, of which the longer is darker by more than a pixel's noise, and how much."""
+    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
+    for one, other in zip(darks, darks[1:], strict=False):
+        if other.exposure_s == one.exposure_s:
+            continue
+        fall = np.mean(
+            [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
+        )
+        if fall > np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes])):
+            return one, other, float(fall)
+    return None
+
+
+def noise_spread(found: Survey, channel: int) -> float:
+    """Relative standard deviation over pixels of the temporal variance at the shortest exposure, by two halves."""
+    groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
+    if not groups:
+        return 0.0
+    halves = [p.halves for p in min(groups, key=lambda g: g.exposure_s).of(channel)]
+    a, b = np.concatenate([h.variance_dn2 for h in halves], 1).astype(np.float64)
+    top = np.quantile(np.concatenate([a, b]), 0.999)
+    a, b = np.minimum(a, top), np.minimum(b, top)
+    return float(np.sqrt(max(covariance_of(a, b), 0.0)) / max(a.mean(), 1e-12))
+
+
+def has_patterns(found: Survey) -> bool:
+    """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
+    for plane in found.shortest.planes if found.shortest is not None else ():
+        noise = plane.components["temporal"].variance_dn2
+        for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
+            one = plane.components[name]
+            if one.variance_dn2 > max(SIGNIFICANT * one.chance_dn2, SMALL_PATTERN * noise):
+                return True
+    return False
+
+
+def _always_bright(found: Survey, channel: int) -> float:
+    """Share of pixels that stand out in every frame of the longest exposure: hits and jumps do not."""
+    several = found.repeated_darks
+    if not several:
+        return 0.0
+    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).of(channel)]
+    lowest = np.concatenate([h.lowest for h in halves]).astype(np.float64)
+    sigma = float(np.sqrt(np.median(np.concatenate([h.pair_variance_dn2 for h in halves]))))
+    level = float(np.median(np.concatenate([h.level_dn for h in halves], 1)))
+    return float(np.mean((lowest > level + HOT_SIGMAS * max(sigma, 0.5))[~found.stuck(channel)]))
+
+
+def can_be_transferred(found: Survey) -> bool:
+    """Whether pixels over time show their noise: hardly clipped, and not ruled by streaks of rows."""
+    groups = found.repeated_darks
+    if not groups or max(g.clipped_share.max() for g in groups) > CLIPPED:
+        return False
+    # Offsets of rows are taken off; a gain of rows grows with the signal, and changes the noise within them.
+    streaks = [[p.components["row_x_frame"].variance_dn2 for p in g.planes] for g in groups]
+    noise = [[p.components["temporal"].variance_dn2 for p in g.planes] for g in groups]
+    grown = np.array(streaks) - np.min(streaks, axis=0)
+    return bool((grown <= STREAKS * np.array(noise)).all())

@@ -1,0 +1,229 @@
+"""One pass over a stack: the noise decomposition of each exposure and colour, and halves of a part of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise._core.types import cfa_tile
+from hsnoise.frames.stack import FrameStack
+from hsnoise.statistics.decomposition import COMPONENTS, Component, PlaneSums, of_neighbouring_rows
+from hsnoise.statistics.narrow_noise import narrow_read_noise
+from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
+
+NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
+FEWEST_STILL = 4  # frames
+NARROW_DN2 = 0.25  # temporal variance below which rounding is no noise of 1/12 DN^2
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One colour plane of one exposure: its channel, means, components, and sampled pixels.
+
+    rows_together: what rows next to each other share in a frame.
+    neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
+    narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
+    """
+
+    channel: int
+    row_mean_dn: np.ndarray
+    column_mean_dn: np.ndarray
+    frame_means_dn: np.ndarray
+    components: dict[str, Component]
+    rows_together: Component
+    halves: Halves | None
+    neighbours_share: float
+    narrow_dn: tuple[float, float] | None
+
+
+class OddLines(NamedTuple):
+    """Lines of the first frame of a group that are no measurement: [line] numbers on the sensor."""
+
+    constant_rows: np.ndarray
+    constant_columns: np.ndarray
+    repeated_rows: np.ndarray
+
+    @staticmethod
+    def of(frame: np.ndarray, step: int) -> OddLines:
+        """Rows and columns of one count throughout, and rows that repeat the one before of the same colours."""
+        rows, columns = np.ptp(frame, axis=1) == 0, np.ptp(frame, axis=0) == 0
+        repeated = np.zeros(len(frame), bool)
+        repeated[step:] = (frame[step:] == frame[:-step]).all(1) & ~rows[step:]
+        return OddLines(*(np.flatnonzero(x) for x in (rows, columns, repeated)))
+
+
+@dataclass(frozen=True)
+class Group:
+    """One exposure: how it was taken, shares of clipped and saturated counts [channel], and its planes."""
+
+    exposure_s: float
+    kind: str
+    n_frames: int
+    clipped_share: np.ndarray
+    saturated_share: np.ndarray
+    odd_lines: OddLines
+    planes: tuple[Plane, ...]
+
+    def of(self, channel: int) -> list[Plane]:
+        """The planes of one channel."""
+        return [plane for plane in self.planes if plane.channel == channel]
+
+    @property
+    def noise_dn(self) -> float:
+        """Temporal noise of the typical pixel, two frames or more; 0 where rounding hides it."""
+        variance = np.concatenate([plane.halves.pair_variance_dn2 for plane in self.planes if plane.halves is not None])
+        return float(np.sqrt(max(float(np.median(variance)), 0.0)))
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What one pass over a stack keeps: its groups, which rows [row] the sampled pixels come from, and the shape."""
+
+    groups: tuple[Group, ...]
+    channels: tuple[str, ...]
+    cfa: str
+    sampled_rows: np.ndarray
+    shape: tuple[int, int]
+    full_scale_dn: float
+
+    def stuck(self, channel: int) -> np.ndarray:
+        """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
+        halves = [[p.halves for p in g.of(channel)] for g in self.groups if g.n_frames > 1]
+        still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
+        noisy: list[bool] = [
+            bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves
+        ]
+        frames = np.sum([of[0].n_frames for of, loud in zip(halves, noisy, strict=True) if loud])
+        if frames < FEWEST_STILL:  # few may agree by chance
+            return np.zeros(len(still[0]) if still else 0, bool)
+        return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
+
+    @property
+    def darks(self) -> tuple[Group, ...]:
+        return tuple(group for group in self.groups if group.kind == "dark")
+
+    @property
+    def repeated_darks(self) -> tuple[Group, ...]:
+        """The dark exposures of two frames or more: only these tell what stays from what changes."""
+        return tuple(group for group in self.darks if group.n_frames > 1)
+
+    @property
+    def has_exposures(self) -> bool:
+        """Whether `repeated_darks` are of several exposures."""
+        return len({group.exposure_s for group in self.repeated_darks}) > 1
+
+    @property
+    def shortest(self) -> Group | None:
+        """The shortest of `repeated_darks`; None without any."""
+        return min(self.repeated_darks, key=lambda group: group.exposure_s, default=None)
+
+
+def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Survey:
+    """Read every frame of `stack` once; `tick` is called after each.
+
+    Raises ValueError for frames that cannot be measured, as `FrameStack.check_frame` does.
+    """
+    cell = len(cfa_tile(stack.cfa))
+    rows = sampled_rows(stack.shape, cell, stack.n_exposures, max(stack.n_frames))
+    highest = 0
+    groups = []
+    for i in range(stack.n_exposures):
+        group, top = _group(stack, i, rows, tick)
+        groups.append(group)
+        highest = max(highest, top)
+    full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
+    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full)
+
+
+def _full_scale(highest: int) -> float:
+    """The code at which counts end: that of a converter of 8, 10, 12, 14 bits if some reach it, else of 16 or more."""
+    if highest in (2**b - 1 for b in (8, 10, 12, 14)):
+        return float(highest)
+    return float(max(2**16 - 1, highest))
+
+
+def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object]) -> tuple[Group, int]:
+    tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
+    step, channels = len(tile), len(stack.channels)
+    sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
+    kept: np.ndarray | None = None
+    odd: OddLines | None = None
+    clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
+    for f, frame in enumerate(stack.frames(i)):
+        if kept is None:
+            kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
+            odd = OddLines.of(frame, step)
+        kept[f] = frame[rows]
+        white = np.inf if stack.white_level is None else stack.white_level
+        for p in range(step * step):
+            plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
+            sums[p].add(plane)
+            clipped[c] += np.count_nonzero(plane == 0)
+            saturated[c] += np.count_nonzero(plane >= white)
+            pixels[c] += plane.size
+        highest = max(highest, int(frame.max()))
+        tick()
+    assert kept is not None and odd is not None  # a group has a frame: FrameStack
+    planes = tuple(
+        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
+    )
+    group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, odd, planes)
+    return group, highest
+
+
+def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
+    n, (h, w) = sums.n_frames, sums.shape
+    halves = halves_of(counts) if n > 1 else None
+    row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
+    reference = float(sums.reference or 0)
+    return Plane(
+        channel=int(channel),
+        row_mean_dn=row_frame.mean(0) + reference,
+        column_mean_dn=column_frame.mean(0) + reference,
+        frame_means_dn=sums.frame_means_dn,
+        components=_with_tails(sums.components(), halves, sums.shape),
+        rows_together=of_neighbouring_rows(row_frame),
+        halves=halves,
+        neighbours_share=_neighbours_share(counts),
+        narrow_dn=_narrow(counts, halves),
+    )
+
+
+def _neighbours_share(counts: np.ndarray) -> float:
+    """Correlation over a row of what changes from the first frame to the second, outliers and lines left out."""
+    if len(counts) < 2:
+        return float("nan")
+    change = counts[1].astype(np.float32) - counts[0]
+    change -= np.median(change, axis=1, keepdims=True)
+    change -= np.median(change, axis=0)
+    width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
+    change = np.clip(change, -width, width)
+    variance = float(np.mean(change**2, dtype=np.float64))
+    return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0
+
+
+def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
+    """Estimate and upper bound of noise that is narrower than a count, DN; None of wider noise."""
+    if halves is None or not 0 < float(halves.pair_variance_dn2.mean()) < NARROW_DN2:
+        return None
+    return narrow_read_noise(counts)
+
+
+def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple[int, int]) -> dict[str, Component]:
+    """Standard errors of what pixels carry from the pixels themselves: their noise differs, and has tails."""
+    if halves is None:
+        return found
+    level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, shape[1])
+    level = level - level.mean(0) - level.mean(1, keepdims=True) + level.mean()
+    scatter = {"temporal": halves.pair_variance_dn2, "pixel": level**2}
+    for name, values in scatter.items():
+        error = float(values.std(dtype=np.float64)) / np.sqrt(shape[0] * shape[1])
+        found[name] = replace(found[name], standard_error_dn2=max(error, found[name].standard_error_dn2))
+    total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
+    return {
+        name: replace(c, share=max(c.variance_dn2, 0.0) / total if total > 0 else float("nan"))
+        for name, c in found.items()
+    }

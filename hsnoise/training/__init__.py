@@ -1,1 +1,0 @@
-"""Training and judging the video enhancer: the commands `hsnoise train` and `hsnoise evaluate`."""
