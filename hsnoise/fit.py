@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.fitting.line import line_fit
@@ -18,7 +19,7 @@ from hsnoise.fitting.notes import closing_notes, outlier_fraction
 from hsnoise.fitting.pixel_fit import measure
 from hsnoise.fitting.pixel_result import POPULATION, result_of
 from hsnoise.fitting.profile import profile_errors
-from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.mosaics import warn_of_a_mosaic
@@ -99,7 +100,7 @@ def fit(
     if pixels not in PIXELS:
         raise ValueError(f"pixels: expected one of {', '.join(PIXELS)}, got {pixels!r}")
     if model is not None and not isinstance(model, NoiseModel):
-        raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
+        raise TypeError(f"{named('model')}: expected a NoiseModel, got {type(model).__name__}")
     source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
     if isinstance(source, Summary) and (method == "transfer" or pixels == "differ"):
         raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")
@@ -143,7 +144,8 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
-            "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
+            f"{named('black_level')}: flats alone do not tell the black level from read noise; give"
+            f" {named('black_level')} or add dark frames"
         )
     with jax.enable_x64(True):
         start = start_physics(summary, with_row_gain, with_clamp)
@@ -154,7 +156,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
             exponent = start.exponent if white_share < 1 else np.asarray(0.0)
             start = replace(start, white_share=white_share, exponent=exponent)
         if method == "line":
-            return _by_line(summary, model, "the paper's line fit, as asked")
+            return _by_line(summary, model, Status.LINE)
         log.info("Maximising the likelihood of rows, pixels pooled")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
         outside = far_outliers(summary)
@@ -165,10 +167,9 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
                 result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
         if converged:
             return result
-        why = result.outcome.removeprefix(NOT_CONVERGED)
         if method == "ml" or with_clamp or white_share is not None:
-            raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
-        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+            raise RuntimeError(f"fit: maximum likelihood did not converge: {result.detail}")
+        return _by_line(summary, model, Status.LINE_INSTEAD, result.detail)
 
 
 def _with_judged_flats(summary: Summary, start: Physics) -> Summary:
@@ -261,7 +262,7 @@ def _check_complete(model: NoiseModel) -> None:
     """Raise ValueError for a model without the effects that every fit has."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
-        raise ValueError(f"model: has no {', '.join(missing)}, without which it cannot be fitted")
+        raise ValueError(f"{named('model')}: has no {', '.join(missing)}, without which it cannot be fitted")
 
 
 def _white_share(model: NoiseModel | None) -> np.ndarray | None:
@@ -276,7 +277,9 @@ def _check_clamp(summary: Summary, method: str) -> None:
     if method == "line":
         raise ValueError("method: the line fit takes the means for the dark signal, which black_clamp hides; use ml")
     if not summary.histograms or np.ptp(summary.exposure_s) == 0:
-        raise ValueError("model: black_clamp shows in darks of two or more exposures only, which this stack has not")
+        raise ValueError(
+            f"{named('model')}: black_clamp shows in darks of two or more exposures only, which this stack has not"
+        )
 
 
 def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, bool]:
@@ -300,8 +303,9 @@ def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, 
         physics=jax.tree.map(np.asarray, maximum.physics),
         names=tuple(names[i] for i in kept),
         covariance=covariance[np.ix_(kept, kept)],
-        method="ml",
-        outcome=("converged: " if maximum.converged else NOT_CONVERGED) + maximum.outcome,
+        method=Method.ML,
+        status=Status.CONVERGED if maximum.converged else Status.NOT_CONVERGED,
+        detail=maximum.outcome,
         iterations=maximum.iterations,
         log_likelihood=maximum.log_likelihood,
         notes=(),
@@ -343,8 +347,8 @@ def _of_hidden_dark_level(covariance: np.ndarray, names, physics: Physics, summa
     return np.outer(moved, moved)
 
 
-def _by_line(summary: Summary, model, outcome: str) -> FitResult:
-    log.info("Line fit: %s", outcome)
+def _by_line(summary: Summary, model, status: Status, detail: str = "") -> FitResult:
+    log.info("Line fit: %s", status)
     line = line_fit(summary)
     coordinates = coordinates_for(summary, line.physics)
     errors = np.asarray(coordinates.flat(jax.tree.map(jnp.asarray, line.standard_errors)))
@@ -353,8 +357,9 @@ def _by_line(summary: Summary, model, outcome: str) -> FitResult:
         physics=jax.tree.map(np.asarray, line.physics),
         names=labels(coordinates, summary.channels),
         covariance=np.diag(errors**2),
-        method="line",
-        outcome=outcome,
+        method=Method.LINE,
+        status=status,
+        detail=detail,
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),

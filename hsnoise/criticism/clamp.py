@@ -12,7 +12,7 @@ from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
 from hsnoise.fit import fit, without_likelihood
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
 
 CLAMP = BlackClamp.name
 DRAWS = 40
@@ -26,7 +26,7 @@ def clamp_by_likelihood(
     It can be done for a maximum-likelihood fit of darks at several exposures, without other effects in the model.
     """
     model = bench.model
-    if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
+    if not isinstance(fitted, FitResult) or fitted.method != Method.ML or CLAMP in model:
         return None
     if without_likelihood(model) or np.ptp(fitted.summary.exposure_s) == 0:
         return None

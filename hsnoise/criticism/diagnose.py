@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.arguments import callback, listed, seed_of, whole_number
+from hsnoise.criticism import sentences
 from hsnoise.criticism.candidates import Maker, built_in, given, made
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.nearest import nearest
+from hsnoise.criticism.outcomes import Side, Verdict, has_sides, on_side
 from hsnoise.criticism.ranking import (
     CLOSE,
     EVIDENCE,
@@ -114,7 +116,9 @@ def diagnose(
     slopes = bench.slopes()
     null = shrunk(bench.base.own_z(), slopes)
     z = bench.base.z(measure(part, model).values)
-    evidence = Evidence(z, null, bench.base.names, bench.base.groups, len(makers) + len(own))
+    evidence = Evidence(
+        z, null, bench.base.names, bench.base.groups, len(makers) + len(own), has_flats="flat" in part.kind
+    )
     judged = _looked_at(_glance(makers, own, bench, evidence), MOST_LIKELY, bench, evidence)
     log.info("Most likely at first: %s", _scores(judged[:WORST]))
     log.debug("All candidates: %s", _scores(judged))
@@ -142,7 +146,7 @@ def diagnose(
                 found = replace(found, unexplained=_what_remains(left, law))
     log.info("Diagnosis: %s", found.conclusion)
     log.debug("%s", found)
-    if found.verdict != "unexplained":
+    if found.verdict != Verdict.UNEXPLAINED:
         return found
     prints = [one.of for one in judged]
     return replace(
@@ -164,10 +168,10 @@ def _may_be_a_clamp(found: Diagnosis, bench: Bench, evidence: Evidence) -> bool:
     """Whether it is worth a second fit. A clamp of which nothing is known leads the fit to another gain, dark current
     and read noise, so far off that draws from there tell of it badly, or not at all: "nothing missing".
     """
-    if found.verdict == "nothing missing":
+    if found.verdict == Verdict.NOTHING_MISSING:
         return evidence.misfit(bench.base.law) > MISFIT
     leaders = [c.name for c in found.ranking[:2] if c.score > EVIDENCE]
-    return found.verdict == "unexplained" or not LIKE_A_CLAMP.isdisjoint(leaders)
+    return found.verdict == Verdict.UNEXPLAINED or not LIKE_A_CLAMP.isdisjoint(leaders)
 
 
 def _best_first(judged: Iterable[Judged]) -> list[Judged]:
@@ -228,16 +232,16 @@ def _drawn_close(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> Ju
 
 
 def _on_its_side(judged: list[Judged], bench: Bench, evidence: Evidence) -> tuple[list[Judged], AbstractEffect | None]:
-    """The first candidate before or behind the gain, where it describes the capture better, the base fitted to it.
+    """The first candidate before or after the gain, where it describes the capture better, the base fitted to it.
 
     Among random details the side goes with what else was drawn; on a base that the effect has bent, they differ little.
     The base took a part of the effect for noise of its own: the estimate with another base is the better one, too.
     """
     first = judged[0]
     effect = first.candidate(evidence).effect
-    if first.score <= EVIDENCE or not hasattr(effect, "after_gain"):
+    if first.score <= EVIDENCE or not has_sides(effect):
         return judged, None
-    sides = [replace(effect, **{"after_gain": side}) for side in (False, True)]
+    sides = [on_side(effect, side) for side in Side]
     found = [(*with_base(one, bench, evidence), one) for one in sides]
     _, estimate, start = max(found, key=lambda one: one[0])
     closer = _drawn_close(start, bench, evidence)
@@ -300,21 +304,21 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
         ranking = [replace(c, effect=found.get(c.name, c.effect)) for c in ranking]
         ranking = sorted(ranking, key=lambda c: names.index(c.name) if c.name in names else len(names))
         first = ranking[0]
-    verdict = "named"
+    verdict = Verdict.NAMED
     if first.score <= evidence.limit and worst <= MISFIT:
-        verdict = "nothing missing"
+        verdict = Verdict.NOTHING_MISSING
     elif first.score <= evidence.limit or left > allowed:
-        verdict = "unexplained"
+        verdict = Verdict.UNEXPLAINED
     elif first.name in ALIKE and not evidence.has_flats:
-        verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
+        verdict, names = Verdict.AMBIGUOUS, (first.name, ALIKE[first.name][0])
     elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
-        verdict, names = "ambiguous", (first.name, second.name)
+        verdict, names = Verdict.AMBIGUOUS, (first.name, second.name)
     partly = first.score > evidence.limit and left < NEAR_ENOUGH * worst
-    if verdict == "nothing missing" or (verdict == "unexplained" and not partly):
+    if verdict == Verdict.NOTHING_MISSING or (verdict == Verdict.UNEXPLAINED and not partly):
         law = evidence.null
     blamed, remaining = _what_remains(evidence, evidence.null).group, _what_remains(evidence, law)
     partner = names if partly else ()
-    if verdict in ("nothing missing", "unexplained"):
+    if verdict in (Verdict.NOTHING_MISSING, Verdict.UNEXPLAINED):
         names = ()
     return Diagnosis(
         ranking=tuple(ranking),
@@ -334,14 +338,10 @@ def _what_remains(evidence: Evidence, law: Gaussian) -> Unexplained:
     return Unexplained(scores[worst], worst, statistics)
 
 
-def _advice(verdict: str, names: tuple[str, ...], first: Candidate, blamed: str, left: str) -> str:
+def _advice(verdict: Verdict, names: tuple[str, ...], first: Candidate, blamed: str, left: str) -> str:
     """blamed, left: the groups of statistics that are worst before and after what comes nearest."""
-    if verdict == "ambiguous":
-        return ALIKE[first.name][1] if first.name in ALIKE else f"more frames would tell {names[0]} from {names[1]}"
-    if verdict == "unexplained" and names:
-        told = f"{' and '.join(names)} would explain part of the {blamed} statistics"
-        beside = "what is left of them" if left == blamed else f"the {left} statistics that are left"
-        return f"{told}; no effect in the library explains {beside}"
-    if verdict == "unexplained":
-        return f"none of the effects in the library explains the {blamed} statistics, and none comes near"
+    if verdict == Verdict.AMBIGUOUS:
+        return ALIKE[first.name][1] if first.name in ALIKE else sentences.more_frames(names)
+    if verdict == Verdict.UNEXPLAINED:
+        return sentences.partly_explained(names, blamed, left) if names else sentences.not_explained(blamed)
     return ""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from hsnoise.criticism import sentences
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -25,16 +24,12 @@ def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, Fram
     return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
 
 
-def told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
+def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     """Which frames were fitted and which held out, in words."""
     if held_out is None:
         return ""
     kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
-    return (
-        f"Fitted and compared were the first {_span(kept)} dark frames of each exposure; held-out: the log-likelihood"
-        f" of the statistics of the other {_span(held_out.n_frames)}, in nats (one more: 2.7 times as probable). To fit"
-        " all of them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
-    )
+    return sentences.split(kept, held_out.n_frames)
 
 
 def log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
@@ -42,7 +37,3 @@ def log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
     own = reference(model, frames, DRAWS, seed + SEEDS)
     values = measure(frames, model).values
     return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
-
-
-def _span(numbers: Sequence[int]) -> str:
-    return f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"

@@ -56,10 +56,7 @@ class Evidence:
     groups: tuple[str, ...]
     candidates: int
     limit: float = EVIDENCE  # log-likelihood ratio from which an effect is there
-
-    @property
-    def has_flats(self) -> bool:
-        return any(group.startswith("flats") for group in self.groups)
+    has_flats: bool = False  # whether the capture has flats
 
     @cached_property
     def nothing(self) -> float:

@@ -30,7 +30,7 @@ from hsnoise.effects import (
     ShotNoise,
 )
 from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.physics import Physics
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
@@ -88,8 +88,9 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         physics=jax.tree.map(np.asarray, physics),
         names=names,
         covariance=covariance,
-        method="transfer",
-        outcome=_outcome(pixel),
+        method=Method.TRANSFER,
+        status=Status.TRANSFER,
+        detail=_detail(pixel),
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),
@@ -107,7 +108,7 @@ def in_electrons(name: str) -> bool:
     return name.startswith(IN_ELECTRONS) or effect in set(POPULATION) - IN_OTHER_UNITS
 
 
-def _outcome(pixel: PixelFit) -> str:
+def _detail(pixel: PixelFit) -> str:
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
     if pixel.flats is not None and pixel.determined:
         return "gain from the flats, read noise from each pixel over time"

@@ -21,7 +21,7 @@ from hsnoise.fitting.covariances import as_scattered, not_surer_than
 from hsnoise.fitting.knobs import Knob, knobs
 from hsnoise.fitting.maximise import gradient_at
 from hsnoise.fitting.notes import near_zero, parameter_notes
-from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.coordinates import Coordinates, coordinates_for, labels
 from hsnoise.likelihood.physics import WITH_LIKELIHOOD, Physics, physics_of
@@ -302,21 +302,21 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     turn = np.zeros((len(y), len(y)))
     turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
     turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
-    of_base = "" if base.method == "ml" else f"; of the fit that it starts from: {base.outcome}"
-    met = "simulated statistics met" if last_step < LONG_STEP else f"{NOT_CONVERGED}simulated statistics not met"
+    of_base = "" if base.method == Method.ML else f"; of the fit that it starts from: {base.outcome}"
     result = replace(
         base,
         params=problem.in_float64(y),
         physics=problem.physics(y),
         names=(*base.names, *(knob.label for knob in problem.knobs)),
         covariance=not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
-        method="synthetic",
-        outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
+        method=Method.SYNTHETIC,
+        status=Status.MET if last_step < LONG_STEP else Status.NOT_MET,
+        detail=f"the last step was {last_step:.1g} standard errors long{of_base}",
         iterations=iterations,
         log_likelihood=float("nan"),
     )
     how = f"{', '.join(problem.extra)}: fitted by simulated statistics (synthetic likelihood), together with all other"
-    of_line = base.notes if base.method == "line" else ()
+    of_line = base.notes if base.method == Method.LINE else ()
     told = (f"{how} parameters.", *of_line, *_loose(problem, covariance, result), *parameter_notes(result))
     return result.with_notes(tuple(dict.fromkeys(told)))
 

@@ -20,7 +20,7 @@ from hsnoise.fitting.flat_notes import gain_notes
 from hsnoise.fitting.notes import order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import in_electrons
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
 from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
@@ -55,7 +55,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
     notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
@@ -63,7 +63,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
 
 def _without_open_gain(result: FitResult) -> FitResult:
     """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
-    gains = [(value, error) for name, (value, error, _) in result.table.items() if name.split(".")[0] == "gain"]
+    gains = [(value, error) for value, error, _ in result.rows_of("gain").values()]
     if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error in gains):
         return result
     names = tuple(name for name in result.params.table if in_electrons(name))
@@ -238,7 +238,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
     """Static structure that a fit by pooled histograms takes for noise."""
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         return
     worst = 0.0
     for c in range(len(found.channels)):
