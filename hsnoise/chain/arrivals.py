@@ -20,8 +20,8 @@ from jax.scipy.special import ndtr
 
 from hsnoise._core.poisson import Regime, normal_of_bits, pixel_words, poisson_of_bits
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects import DarkCurrent, ReadNoise, ShotNoise
-from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, param
+from hsnoise.effects import AbstractEffect, Capture, DarkCurrent, ReadNoise, ShotNoise, Stage, param
+from hsnoise.effects._base import PIXELS
 
 NODES, UNROLLED = 33, 11  # of the sum over numbers of electrons
 STIRLING_FROM = 20.0

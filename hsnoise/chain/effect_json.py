@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise.effects import AbstractEffect
-from hsnoise.effects._base import shortest
+from hsnoise.effects._parameters import shortest
 
 
 def effect_to_json(effect: AbstractEffect, channels: tuple[str, ...]) -> dict[str, Any]:

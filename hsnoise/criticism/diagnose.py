@@ -9,6 +9,7 @@ systems", Nature 466, 2010), and a verdict is given only if the winner also expl
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.arguments import callback, listed, seed_of, whole_number
-from hsnoise.criticism.candidates import Maker, built_in, given, made
+from hsnoise.criticism.candidates import Suspect, built_in, can_be_proposed, facts_of, given, made, proposed
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import MISFIT_LEFT, WORST, Diagnosis, Unexplained
 from hsnoise.criticism.fingerprint import Bench
@@ -37,9 +38,10 @@ from hsnoise.criticism.ranking import (
 )
 from hsnoise.criticism.reference import measure, reference
 from hsnoise.criticism.refine import refined, refined_pair, with_base
-from hsnoise.effects import AbstractEffect
+from hsnoise.effects import AbstractEffect, CaptureFacts, Maker
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_effects, check_fits, part_of
 
@@ -59,8 +61,6 @@ MISFIT = 4.5  # normal score of the worst group from which something is there
 SHARE_LEFT, MOST_LEFT = 0.05, 10.0
 NEAR_ENOUGH = 0.5  # share of the misfit that an effect may leave to be called a part of the explanation
 AMBIGUOUS = 3.0  # log-likelihood ratio between two names
-# Effects that change darks as another gain, dark current and read noise would; and the capture that decides.
-ALIKE = {"black_clamp": ("gain", "flats (evenly lit frames of two or more brightnesses) measure the gain by itself")}
 FEW = 2  # effects that a fit put in, of which one alone may be all that there is
 LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
 
@@ -78,7 +78,8 @@ def diagnose(
         fit: result of `hsnoise.fit` on this capture, or one like it (a NoiseModel is taken, too).
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
             FrameStack's keywords. Darks, and flats if there are any.
-        candidates: effects of your own, ready-made instances, that take part beside the built-in ones.
+        candidates: effects of your own that take part beside the built-in ones: classes with a `propose`, which know
+            their sizes, or ready-made instances, which are tried at several sizes around their own.
         draws: captures drawn from the fitted model; seed: of all draws.
         progress: called with no argument after each capture that is drawn.
 
@@ -101,12 +102,15 @@ def diagnose(
     if not isinstance(model, NoiseModel):
         raise TypeError(f"fit: expected a result of hsnoise.fit or a NoiseModel, got {type(fit).__name__}")
     check_fits(model, stack, "fit")
-    own = {effect.name: given(effect) for effect in not_in(model, check_candidates(candidates))}
+    candidates = not_in(model, check_candidates(candidates))
     part = part_of(stack)
     check_effects(model, part)
-    for maker in own.values():
-        check_effects(model.add(made(maker, 1.0, 0)), part)
-    makers = {name: maker for name, maker in built_in(model, part).items() if name not in own}
+    facts = facts_of(model, part)
+    own = check_makers(candidates, model, part, facts)
+    unseen = [one.name for one in candidates if one.name not in own]
+    if unseen:
+        warnings.warn(f"candidates: {', '.join(unseen)} not tried: this capture cannot show it", stacklevel=2)
+    makers = {name: maker for name, maker in built_in(facts).items() if name not in own}
     log.info(
         "Drawing %d captures from the model, and each of %d candidates on top of it", draws, len(makers) + len(own)
     )
@@ -262,14 +266,19 @@ def _best_pair(judged: list[Judged], makers: dict[str, Maker], bench: Bench, evi
     return max(refined_ones, key=lambda one: one.score, default=None)
 
 
-def check_candidates(candidates: Any) -> tuple[AbstractEffect, ...]:
+def check_candidates(candidates: Any) -> tuple[Suspect, ...]:
     """The candidates of a user. Raises TypeError unless they are effects, ValueError for two of one name."""
-    if isinstance(candidates, AbstractEffect):
+    if isinstance(candidates, AbstractEffect) or _is_effect_class(candidates):
         raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
     candidates = listed("candidates", candidates, "a list of effects")
     for effect in candidates:
-        if not isinstance(effect, AbstractEffect):
-            raise TypeError(f"candidates: expected effects (instances of AbstractEffect), got {effect!r}")
+        if _is_effect_class(effect) and not can_be_proposed(effect):
+            raise TypeError(
+                f"candidates: expected effects that are instances, or classes with a propose; {effect.__name__} is a"
+                " class without one"
+            )
+        if not isinstance(effect, AbstractEffect) and not _is_effect_class(effect):
+            raise TypeError(f"candidates: expected effects (of AbstractEffect), got {effect!r}")
     names = [effect.name for effect in candidates]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -277,7 +286,28 @@ def check_candidates(candidates: Any) -> tuple[AbstractEffect, ...]:
     return candidates
 
 
-def not_in(model, candidates: tuple[AbstractEffect, ...]) -> tuple[AbstractEffect, ...]:
+def _is_effect_class(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, AbstractEffect)
+
+
+def check_makers(
+    candidates: tuple[Suspect, ...], model: NoiseModel, part: FrameStack, facts: CaptureFacts
+) -> dict[str, Maker]:
+    """Makers of a user's candidates, by name, less what the capture cannot show.
+
+    Raises TypeError for a `propose` that gives no such effect, ValueError for draws that are no signal of a sensor.
+    """
+    makers = proposed(candidates, facts)
+    for one in candidates:
+        if one.name in makers:
+            effect = made(makers[one.name], 1.0, 0)
+            if getattr(effect, "name", None) != one.name:
+                raise TypeError(f"candidates: expected {one.name}.propose to make {one.name} effects, got {effect!r}")
+            check_effects(model.add(effect), part)
+    return makers
+
+
+def not_in(model, candidates: tuple[Suspect, ...]) -> tuple[Suspect, ...]:
     """The candidates. Raises ValueError for one that the model has."""
     for effect in candidates:
         if effect.name in model:
@@ -305,8 +335,8 @@ def _verdict(ranking: list[Candidate], pair: Pair | None, evidence: Evidence, la
         verdict = "nothing missing"
     elif first.score <= evidence.limit or left > allowed:
         verdict = "unexplained"
-    elif first.name in ALIKE and not evidence.has_flats:
-        verdict, names = "ambiguous", (first.name, ALIKE[first.name][0])
+    elif first.effect.confounded_with and not evidence.has_flats:
+        verdict, names = "ambiguous", (first.name, first.effect.confounded_with)
     elif len(names) == 1 and second is not None and first.score - second.score < AMBIGUOUS:
         verdict, names = "ambiguous", (first.name, second.name)
     partly = first.score > evidence.limit and left < NEAR_ENOUGH * worst
@@ -337,7 +367,7 @@ def _what_remains(evidence: Evidence, law: Gaussian) -> Unexplained:
 def _advice(verdict: str, names: tuple[str, ...], first: Candidate, blamed: str, left: str) -> str:
     """blamed, left: the groups of statistics that are worst before and after what comes nearest."""
     if verdict == "ambiguous":
-        return ALIKE[first.name][1] if first.name in ALIKE else f"more frames would tell {names[0]} from {names[1]}"
+        return first.effect.decided_by or f"more frames would tell {names[0]} from {names[1]}"
     if verdict == "unexplained" and names:
         told = f"{' and '.join(names)} would explain part of the {blamed} statistics"
         beside = "what is left of them" if left == blamed else f"the {left} statistics that are left"

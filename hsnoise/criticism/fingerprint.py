@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hsnoise._core.threads import in_threads
-from hsnoise.criticism.candidates import Maker, made
+from hsnoise.criticism.candidates import made
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.reference import Reference, measure
+from hsnoise.effects import Maker
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import draw_capture

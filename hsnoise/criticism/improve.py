@@ -12,8 +12,9 @@ import numpy as np
 
 from hsnoise._core.arguments import callback, counter, seed_of, whole_number
 from hsnoise._core.types import unit_in_words
+from hsnoise.criticism.candidates import Suspect, facts_of
 from hsnoise.criticism.compare import DRAWS, Comparison, compare
-from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
+from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, check_makers, diagnose, not_in
 from hsnoise.criticism.held_out import log_likelihood, split_frames, told_of
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import CHANCE_ERROR, FINISHED, Step, Story
@@ -25,7 +26,7 @@ from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, darks_of
+from hsnoise.simulation.draws import check_fits, darks_of
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ def improve(
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
             FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
-        candidates: effects of your own that may be added, too.
+        candidates: effects of your own that may be added, too, classes or instances as `diagnose` takes them.
         max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
             fit is finished in any case); None: as long as it takes.
         max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
@@ -147,7 +148,7 @@ class _Work:
         log.info("%s", text)
         self.tell(text)
 
-    def turn(self, steps: list[Step], own: Sequence[AbstractEffect]) -> str:
+    def turn(self, steps: list[Step], own: Sequence[Suspect]) -> str:
         """Diagnose the last step, and append one more; if there is none, why the story ends.
 
         Raises _TimeIsUp at the first draw after the limit: `steps` are as they were then, but for a diagnosis.
@@ -253,15 +254,14 @@ def _stage(what: str, steps: Sequence[Step]) -> str:
     )
 
 
-def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
+def _check_start(model: NoiseModel | None, candidates: tuple[Suspect, ...], stack: FrameStack) -> None:
     """Raise ValueError or TypeError for a model or candidates that cannot be drawn."""
     if not candidates:
         return
     typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
     base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
     check_fits(base, stack, "model")
-    for effect in not_in(base, candidates):
-        check_effects(base.add(effect), stack)
+    check_makers(not_in(base, candidates), base, stack, facts_of(base, stack))
 
 
 def _why_worse(step: Step, before: Step) -> str:
@@ -283,20 +283,23 @@ def _why_worse(step: Step, before: Step) -> str:
 
 
 def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
-    """Whether some size of the effect is beyond chance in a fit with it.
+    """Whether some amplitude of the effect is beyond chance in a fit with it; one that fits hold, whether it is set.
 
-    Sizes may be 0 and have no upper bound, unlike places and shares; of an effect without any, numbers of either sign
-    count, or shares.
+    Of an effect that marks none, numbers that may be 0 and have no upper bound count, or else those of either sign, or
+    shares.
     """
     found = effect.parameters(result.params.channels)
     kinds = (
-        [p.name for p in found if p.spec.low == 0 and p.spec.high is None],
-        [p.name for p in found if p.spec.low is None],
-        [p.name for p in found if p.spec.low == 0],
+        [p for p in found if p.spec.amplitude],
+        [p for p in found if p.spec.low == 0 and p.spec.high is None],
+        [p for p in found if p.spec.low is None],
+        [p for p in found if p.spec.low == 0],
     )
-    sizes = next((names for names in kinds if names), [])
-    rows = [result.table[name] for name in sizes if name in result.names]
-    return not rows or any(abs(value) > THERE_SIGMA * error for value, error, _ in rows)
+    amplitudes = next((some for some in kinds if some), [])
+    fitted = [p.spec.from_absent(*result.table[p.name][:2]) for p in amplitudes if p.name in result.names]
+    if not fitted:
+        return not amplitudes or any(p.spec.from_absent(p.value)[0] != 0 for p in amplitudes)
+    return any(abs(off) > THERE_SIGMA * error for off, error in fitted)
 
 
 def _left_out(refused: dict[str, str], found: Diagnosis, comparison: Comparison) -> str:

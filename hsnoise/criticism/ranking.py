@@ -18,7 +18,6 @@ CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
 PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
 LEAST_P = 1e-9
 EVIDENCE = 8.0  # least log-likelihood ratio from which an effect is there: Markov's inequality, of 27 candidates
-CHOSEN = {"periodic_banding": 5.0}  # nats: its frequency is that of the highest of some hundred lines of the capture
 FALSE_ALARMS, TAIL = 0.001, 0.1  # probability of one; share of the draws that tell how the scores of chance fall off
 LEADERS = 3  # candidates that are paired with all others
 
@@ -114,7 +113,7 @@ def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) ->
     laws = [of.law(float(amplitude), evidence.null) for amplitude in amplitudes]
     scores = [evidence.score(law) for law in laws]
     i = int(np.argmax(scores))
-    score = scores[i] - CHOSEN.get(of.name, 0.0)
+    score = scores[i] - made(of.maker, 1.0, 0).selection_nats
     return Judged(of, float(amplitudes[i]), score, evidence.misfit(laws[i]))
 
 

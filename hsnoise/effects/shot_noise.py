@@ -17,6 +17,7 @@ class ShotNoise(AbstractEffect):
     name: ClassVar[str] = "shot_noise"
     stage: ClassVar[Stage] = Stage.PHOTONS
     stream: ClassVar[str] = PIXELS
+    in_likelihood: ClassVar[bool] = True
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return electrons_of_pixels(key, signal)

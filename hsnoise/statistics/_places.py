@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from hsnoise._core.types import cfa_tile
+from hsnoise.effects import Places
 from hsnoise.frames.stack import FrameStack
 
 LENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the decay of a black level, in widths or heights of the frame
@@ -16,19 +16,6 @@ ENDS = (0.0, 0.5, 1.0)
 SPOTS = [(row, column) for row in ENDS for column in ENDS if (row, column) != (0.5, 0.5)]
 BLOCKS = 16  # of a map, in each direction
 FEWEST_FRAMES = 2
-
-
-@dataclass(frozen=True)
-class Places:
-    """What comes closest to the dark frames, whether or not there is any of it.
-
-    shading: axis, start, above and length of a `BlackShading`. glow: row and column of an `AmplifierGlow`.
-    second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1.
-    """
-
-    shading: tuple[str, str, bool, float]
-    glow: tuple[float, float]
-    second_chain: int
 
 
 def places(stack: FrameStack) -> Places:

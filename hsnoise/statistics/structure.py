@@ -16,10 +16,10 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
 from hsnoise.statistics._anova import Exposure, Layout, check_size, layout_of, read_exposure
 from hsnoise.statistics._codes import code_step
-from hsnoise.statistics._places import Places, places
+from hsnoise.statistics._places import places
 from hsnoise.statistics._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["Places", "SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
+__all__ = ["SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,10 +197,10 @@ def test_a_large_capture_keeps_its_place_on_the_sensor():
 
 def test_a_capture_of_one_exposure_is_offered_no_clamp():
     darks = darks_of(empty_stack(exposure_s=(0.1,)))
-    assert "black_clamp" not in library.built_in(
-        hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0), darks
-    )
-    assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
+    dim = hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0)
+    assert "black_clamp" not in library.built_in(library.facts_of(dim, darks))
+    bright = MODEL.with_value("dark_current", "rate", 500.0)
+    assert "black_clamp" in library.built_in(library.facts_of(bright, darks_of(empty_stack())))
 
 
 @pytest.mark.slow
