@@ -8,10 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism.candidates import made
-from hsnoise.criticism.fingerprint import Fingerprint, law_of
-from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.fingerprint import Fingerprint, distribution_of
 from hsnoise.effects import AbstractEffect
+from hsnoise.simulation.gaussian import Gaussian
 
 GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
 CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
@@ -47,7 +48,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the candidates are judged by: z [statistic] of the capture, its law if nothing is missing, names, groups."""
+    """What the candidates are judged by: z [statistic] of the capture, its distribution if nothing is missing, names, groups."""
 
     z: np.ndarray
     null: Gaussian
@@ -65,12 +66,12 @@ class Evidence:
         """Log density of the capture if nothing is missing."""
         return float(self.null.log_density(self.z))
 
-    def score(self, law: Gaussian) -> float:
-        """Log-likelihood ratio of a law against "nothing missing"."""
-        return float(law.log_density(self.z)) - self.nothing
+    def score(self, distribution: Gaussian) -> float:
+        """Log-likelihood ratio of a distribution against "nothing missing"."""
+        return float(distribution.log_density(self.z)) - self.nothing
 
-    def misfit(self, law: Gaussian) -> float:
-        return max(law.normal_scores(self.z, self.groups).values())
+    def misfit(self, distribution: Gaussian) -> float:
+        return max(distribution.normal_scores(self.z, self.groups).values())
 
     def p_value(self, score: float) -> float:
         # A likelihood ratio exceeds c by chance at most once in exp(c) (Markov), in any of the candidates.
@@ -87,8 +88,9 @@ class Judged:
     misfit: float
 
     def candidate(self, evidence: Evidence) -> Candidate:
-        covariance = self.of.law(self.amplitude, evidence.null).covariance
-        closest = [Gaussian(shift, covariance).log_density(evidence.z) for shift in self.of.at(self.amplitude)]
+        covariance = self.of.distribution(self.amplitude, evidence.null).covariance
+        off = evidence.z - self.of.at(self.amplitude)
+        closest = Gaussian(np.zeros(off.shape[1]), covariance).log_density(off)
         effect = made(self.of.maker, self.amplitude, int(np.argmax(closest)))
         return Candidate(self.of.name, effect, self.score, evidence.p_value(self.score), self.misfit)
 
@@ -105,27 +107,35 @@ class Pair:
     shifts: tuple[np.ndarray, np.ndarray]
     score: float
     misfit: float
-    law: Gaussian
+    distribution: Gaussian
+
+
+def judge_all(prints: Iterable[Fingerprint], evidence: Evidence, amplitudes: np.ndarray = GRID) -> list[Judged]:
+    """Fingerprints at the best of some amplitudes each, best first."""
+    found = in_threads(lambda of: judge(of, evidence, amplitudes), prints)
+    return sorted(found, key=lambda one: -one.score)
 
 
 def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) -> Judged:
     """A fingerprint at the best of some amplitudes."""
-    laws = [of.law(float(amplitude), evidence.null) for amplitude in amplitudes]
-    scores = [evidence.score(law) for law in laws]
+    tried = [of.distribution(float(amplitude), evidence.null) for amplitude in amplitudes]
+    scores = [evidence.score(distribution) for distribution in tried]
     i = int(np.argmax(scores))
     score = scores[i] - made(of.maker, 1.0, 0).selection_nats
-    return Judged(of, float(amplitudes[i]), score, evidence.misfit(laws[i]))
+    return Judged(of, float(amplitudes[i]), score, evidence.misfit(tried[i]))
 
 
 def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray) -> float:
     """Score that hardly any capture with nothing missing exceeds, from the z [draw, statistic] of such draws, nats.
 
-    Laws that are estimated from few draws give more by chance than Markov's inequality allows. The best scores of the
-    draws fall off exponentially.
+    With distributions estimated from few draws, scores exceed Markov's bound. The best scores of the draws fall off
+    exponentially.
     """
-    nothing = null.log_density(z)
-    laws = [of.law(float(amplitude), null) for of in prints for amplitude in GRID[::2]]
-    best = np.max([law.log_density(z) for law in laws], 0) - nothing
+
+    def best_of(of: Fingerprint) -> np.ndarray:
+        return np.max([of.distribution(float(amplitude), null).log_density(z) for amplitude in GRID[::2]], 0)
+
+    best = np.max(in_threads(best_of, prints), 0) - null.log_density(z)
     start = float(np.quantile(best, 1 - TAIL))
     beyond = float(np.mean(best[best > start] - start)) if (best > start).any() else 0.0
     return max(EVIDENCE, start + beyond * float(np.log(TAIL / FALSE_ALARMS)))
@@ -133,39 +143,46 @@ def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray
 
 def best_pairs(judged: list[Judged], evidence: Evidence, number: int) -> list[Pair]:
     """The pairs that describe the capture best, of the leading candidates with all others; `judged` is best first."""
-    found = []
-    for i, first in enumerate(judged[:LEADERS]):
-        alone = {float(a): first.of.law(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude}
-        for second in judged[i + 1 :]:
-            laws = _laws_together(alone, second, evidence.null)
-            scored = [(evidence.score(law), amplitudes, law) for amplitudes, law in laws]
-            found.append((*max(scored, key=lambda one: one[0]), (first, second)))
-    best = sorted(found, key=lambda one: -one[0])[:number]
-    return [_pair(score, amplitudes, law, both, evidence) for score, amplitudes, law, both in best]
+    alone = {
+        first.of.name: {
+            float(a): first.of.distribution(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude
+        }
+        for first in judged[:LEADERS]
+    }
+
+    def best_of(both: tuple[Judged, Judged]):
+        together = _together(alone[both[0].of.name], both[1], evidence.null)
+        scored = [(evidence.score(distribution), amplitudes, distribution) for amplitudes, distribution in together]
+        return (*max(scored, key=lambda one: one[0]), both)
+
+    pairs = [(first, second) for i, first in enumerate(judged[:LEADERS]) for second in judged[i + 1 :]]
+    best = sorted(in_threads(best_of, pairs), key=lambda one: -one[0])[:number]
+    return [_pair(*one, evidence) for one in best]
 
 
-def _pair(score: float, amplitudes, law: Gaussian, both, evidence: Evidence) -> Pair:
+def _pair(score: float, amplitudes, distribution: Gaussian, both, evidence: Evidence) -> Pair:
     first, second = (replace(one, amplitude=a).candidate(evidence) for one, a in zip(both, amplitudes, strict=True))
     shifts = [one.of.at(a).mean(0) for one, a in zip(both, amplitudes, strict=True)]
     names, effects = (first.name, second.name), (first.effect, second.effect)
-    return Pair(names, effects, (shifts[0], shifts[1]), score, evidence.misfit(law), law)
+    return Pair(names, effects, (shifts[0], shifts[1]), score, evidence.misfit(distribution), distribution)
 
 
 def closest(of: Fingerprint, evidence: Evidence, beside: np.ndarray) -> AbstractEffect:
     """The effect with the amplitude and details that describe the capture best, with `beside` shifting it, too."""
-    scored = []
-    for amplitude in map(float, GRID):
+
+    def best_at(amplitude: float) -> tuple[float, float, int]:
         shifts = of.at(amplitude)
-        covariance = law_of(shifts, evidence.null, of_details=False).covariance
-        densities = [Gaussian(one + beside, covariance).log_density(evidence.z) for one in shifts]
-        scored += [(float(density), amplitude, detail) for detail, density in enumerate(densities)]
-    _, amplitude, detail = max(scored, key=lambda one: one[0])
+        covariance = distribution_of(shifts, evidence.null, of_details=False).covariance
+        densities = Gaussian(np.zeros(len(beside)), covariance).log_density(evidence.z - beside - shifts)
+        return float(densities.max()), amplitude, int(densities.argmax())
+
+    _, amplitude, detail = max(in_threads(best_at, map(float, GRID)), key=lambda one: one[0])
     return made(of.maker, amplitude, detail)
 
 
-def _laws_together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
-    """Amplitudes and laws with both effects in the sensor, `alone` those of the first: shifts and scatters add."""
+def _together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
+    """Amplitudes and distributions with both effects in the sensor, `alone` those of the first: all of it adds."""
     for b in PAIR_SECOND:
-        other = second.of.law(float(b), null)
+        other = second.of.distribution(float(b), null)
         for a, one in alone.items():
             yield (a, float(b)), Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)
