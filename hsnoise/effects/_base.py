@@ -222,6 +222,7 @@ class AbstractEffect(eqx.Module):
         stage: where in the sensor it acts.
         in_series: whether what happens in a frame depends on those before it, or on how many there were.
         adds: whether it adds electrons that do not depend on the signal.
+        in_likelihood: whether the exact likelihood of row histograms knows it; else simulated statistics fit it.
         stream: name of its random key; its own name if empty.
     """
 
@@ -229,6 +230,7 @@ class AbstractEffect(eqx.Module):
     stage: eqx.AbstractClassVar[Stage]
     in_series: ClassVar[bool] = False
     adds: ClassVar[bool] = False
+    in_likelihood: ClassVar[bool] = False
     stream: ClassVar[str] = ""
 
     @property

@@ -22,6 +22,7 @@ class BlackClamp(AbstractEffect):
 
     name: ClassVar[str] = "black_clamp"
     stage: ClassVar[Stage] = Stage.BLACK
+    in_likelihood: ClassVar[bool] = True
     rate: PerChannel = param("DN/s", low=0, per_channel=True, doc="dark level that the camera subtracts")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

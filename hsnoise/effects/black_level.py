@@ -13,6 +13,7 @@ class BlackLevel(AbstractEffect):
 
     name: ClassVar[str] = "black_level"
     stage: ClassVar[Stage] = Stage.BLACK
+    in_likelihood: ClassVar[bool] = True
     value: PerChannel = param("DN", per_channel=True, doc="mean count of a pixel without electrons")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

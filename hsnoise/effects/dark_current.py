@@ -16,6 +16,7 @@ class DarkCurrent(AbstractEffect):
 
     name: ClassVar[str] = "dark_current"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    in_likelihood: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, doc="dark electrons of a pixel in a second")
 

@@ -16,6 +16,7 @@ class Gain(AbstractEffect):
 
     name: ClassVar[str] = "gain"
     stage: ClassVar[Stage] = Stage.GAIN
+    in_likelihood: ClassVar[bool] = True
     value: PerChannel = param("DN/e-", low=0, per_channel=True, doc="system gain")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

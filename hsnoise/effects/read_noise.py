@@ -19,6 +19,7 @@ class ReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.READ
+    in_likelihood: ClassVar[bool] = True
     stream: ClassVar[str] = PIXELS
     sigma: Scalar = param("e-", low=0, doc="standard deviation of the read noise")
 

@@ -31,6 +31,7 @@ class RowGain(AbstractEffect):
 
     name: ClassVar[str] = "row_gain"
     stage: ClassVar[Stage] = Stage.GAIN
+    in_likelihood: ClassVar[bool] = True
     sigma: PerChannel = param("1", low=0, per_channel=True, doc="standard deviation of the gain over rows")
     exponent: Scalar = param("1", doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
     white_share: Scalar = param(
