@@ -24,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hsnoise.likelihood.physics import evaluate, physics_of
 from rich.console import Console
 from rich.table import Table
 
@@ -32,7 +33,6 @@ from hsnoise.effects import ADC
 from hsnoise.enhance.training.noisy import camera_of
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, examples
-from hsnoise.likelihood.physics import evaluate, physics_of
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.likelihood.summary import summarise, without_counts
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hsnoise.likelihood.physics import evaluate, physics_of
 from scipy import stats
 
 import hsnoise
 from hsnoise._core.compiling import _lean_options, jit_lean
 from hsnoise.likelihood import plan
 from hsnoise.likelihood.moments import start_physics
-from hsnoise.likelihood.physics import evaluate, physics_of
 from hsnoise.likelihood.plan import plan_rules
 from hsnoise.likelihood.summary import some_frames, summarise
 from hsnoise.model import sample_dark

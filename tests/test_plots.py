@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from hsnoise.likelihood.physics import physics_of
 
 import hsnoise
 from hsnoise import plots
-from hsnoise.likelihood.physics import physics_of
 from hsnoise.likelihood.summary import summarise
 from hsnoise.plots._histograms import _coarse
 from hsnoise.plots._moments import beta_rule, count_moments

@@ -24,7 +24,6 @@ from hsnoise.fitting.result import FitResult, number, rounded
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
-from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits, darks_of
 
@@ -345,7 +344,7 @@ def _fit_with(effect: AbstractEffect, steps: list[Step], fitted: FrameStack, tic
     """A fit of the last model and one effect more; it goes on from the last fit by likelihood if that holds."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != "synthetic"), None)
-    if base is None or any(name in WITH_LIKELIHOOD and name not in base.params for name in model.names):
+    if base is None or any(one.in_likelihood and one.name not in base.params for one in model):
         return fit(fitted, model=model)
     return fit_synthetic(base, fitted, model, progress=tick)
 

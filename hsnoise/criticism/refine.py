@@ -13,7 +13,7 @@ from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, law_of
 from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
-from hsnoise.fitting.knobs import Knob, knobs
+from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import share_of_far
 
@@ -40,7 +40,7 @@ def refined(effects: Sequence[AbstractEffect], bench: Bench, evidence: Evidence)
         information = weighted @ slopes + np.eye(len(gone)) / PRIOR_SIGMA**2
         return np.linalg.solve(information, weighted @ (evidence.z - mean))
 
-    model = _stepped(model, knobs(model, names), step, bench)
+    model = _stepped(model, parameters_of(model, names), step, bench)
     return tuple(model[name] for name in names)
 
 
@@ -63,8 +63,8 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
     """
     own = bench.base.law.covariance
     model = bench.model.add(effect)
-    turned = knobs(model, (effect.name,)), _base_knobs(model)
-    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in turned]) ** -2
+    own_numbers, of_base = parameters_of(model, (effect.name,)).numbers, _base_numbers(model)
+    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(own_numbers), len(of_base)]) ** -2
 
     def step(shifts: np.ndarray, slopes: np.ndarray, gone: np.ndarray) -> np.ndarray:
         law = _law_nearby(shifts, own)
@@ -73,19 +73,19 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
         weighted = slopes.T @ (share[:, None] * np.linalg.inv(law.covariance) * share)
         return np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * gone)
 
-    there = _stepped(model, [*turned[0], *turned[1]], step, bench)
+    there = _stepped(model, of_numbers(model, (*own_numbers, *of_base)), step, bench)
     numbers = range(min(MANY_DRAWS, len(bench.base.draws)))
     shifts = np.stack(in_threads(lambda number: bench.shift(there, number), numbers, bench.tick))
     return evidence.score(_law_nearby(shifts, own)), there[effect.name]
 
 
-def _stepped(model: NoiseModel, turned: list[Knob], step_of: Step, bench: Bench) -> NoiseModel:
+def _stepped(model: NoiseModel, turned: Parameters, step_of: Step, bench: Bench) -> NoiseModel:
     """The model after a few steps of its numbers, made from shifts, slopes and how far the numbers have gone."""
-    start = y = np.array([knob.read(model) for knob in turned])
-    for _ in range(ITERATIONS if turned else 0):  # an effect may hold all its numbers
+    start = y = turned.read(model)
+    for _ in range(ITERATIONS if turned.numbers else 0):  # an effect may hold all its numbers
         step = step_of(*_shifts_and_slopes(model, turned, y, bench), y - start)
         y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    return _at(model, turned, y)
+    return turned.put(model, y)
 
 
 def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
@@ -94,31 +94,20 @@ def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
     return Gaussian(mean, own * (1 + 1 / len(shifts)) + np.diag((NEARBY_ERROR * mean) ** 2))
 
 
-def _base_knobs(model: NoiseModel) -> list[Knob]:
+def _base_numbers(model: NoiseModel) -> list[Number]:
     """The base parameters that are not zero; black levels are told by the means of the counts alone."""
-    found = []
-    for name, field in BASE.items():
-        if name in model and name != "black_level":
-            values = np.asarray(getattr(model[name], field), float)
-            places = [place for place in np.ndindex(values.shape) if values[place] > TINY]
-            found += [Knob(name, name, field, place, 0.0, None) for place in places]
-    return found
+    names = [name for name in BASE if name in model and name != "black_level"]
+    return [n for n in numbers_of(model, names) if n.field == BASE[n.effect] and n.value_in(model) > TINY]
 
 
 def _shifts_and_slopes(
-    model: NoiseModel, turned: list[Knob], y: np.ndarray, bench: Bench
+    model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts at y [draw, statistic] and their derivatives [statistic, knob], by common random numbers."""
-    moved = [_at(model, turned, y + STEP * (np.arange(len(y)) == i)) for i in range(len(y))]
-    tasks = [(_at(model, turned, y), number) for number in range(DRAWS)]
+    """Shifts at y [draw, statistic] and their derivatives [statistic, number], by common random numbers."""
+    moved = [turned.put(model, y + STEP * (np.arange(len(y)) == i)) for i in range(len(y))]
+    tasks = [(turned.put(model, y), number) for number in range(DRAWS)]
     tasks += [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
     drawn = np.stack(in_threads(lambda task: bench.shift(*task), tasks, bench.tick))
     shifts = drawn[:DRAWS]
     apart = drawn[DRAWS:].reshape(len(y), SLOPE_DRAWS, -1) - shifts[None, :SLOPE_DRAWS]
     return shifts, apart.mean(1).T / STEP
-
-
-def _at(model: NoiseModel, turned: list[Knob], y: np.ndarray) -> NoiseModel:
-    for knob, x in zip(turned, y, strict=True):
-        model = knob.put(model, x)
-    return model

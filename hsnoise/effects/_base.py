@@ -181,8 +181,8 @@ class AbstractEffect(eqx.Module):
         stage: where in the sensor it acts.
         in_series: whether what happens in a frame depends on those before it, or on how many there were.
         adds: whether it adds electrons that do not depend on the signal.
+        in_likelihood: whether the exact likelihood of row histograms knows it; else simulated statistics fit it.
         stream: name of its random key; its own name if empty.
-        in_likelihood: whether the exact likelihood knows it; else fits simulate it.
         least_frames: frames of one exposure that it takes to show it.
         selection_nats: what its score must make up for a detail that is read off the capture and not drawn at random.
         confounded_with: what changes darks as it does, so that only flats tell the two apart; empty if nothing does.
@@ -193,8 +193,8 @@ class AbstractEffect(eqx.Module):
     stage: eqx.AbstractClassVar[Stage]
     in_series: ClassVar[bool] = False
     adds: ClassVar[bool] = False
-    stream: ClassVar[str] = ""
     in_likelihood: ClassVar[bool] = False
+    stream: ClassVar[str] = ""
     least_frames: ClassVar[int] = 1
     selection_nats: ClassVar[float] = 0.0
     confounded_with: ClassVar[str] = ""

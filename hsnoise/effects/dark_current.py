@@ -17,8 +17,8 @@ class DarkCurrent(AbstractEffect):
 
     name: ClassVar[str] = "dark_current"
     stage: ClassVar[Stage] = Stage.ELECTRONS
-    adds: ClassVar[bool] = True
     in_likelihood: ClassVar[bool] = True
+    adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, amplitude=True, doc="dark electrons of a pixel in a second")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

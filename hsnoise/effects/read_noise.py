@@ -20,8 +20,8 @@ class ReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.READ
-    stream: ClassVar[str] = PIXELS
     in_likelihood: ClassVar[bool] = True
+    stream: ClassVar[str] = PIXELS
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation of the read noise")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

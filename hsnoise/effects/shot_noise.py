@@ -16,8 +16,8 @@ class ShotNoise(AbstractEffect):
 
     name: ClassVar[str] = "shot_noise"
     stage: ClassVar[Stage] = Stage.PHOTONS
-    stream: ClassVar[str] = PIXELS
     in_likelihood: ClassVar[bool] = True
+    stream: ClassVar[str] = PIXELS
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return electrons_of_pixels(key, signal)

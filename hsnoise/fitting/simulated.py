@@ -18,13 +18,12 @@ import numpy as np
 from hsnoise._core.threads import in_threads
 from hsnoise._core.types import unit_in_words
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
-from hsnoise.fitting.knobs import Knob, knobs
 from hsnoise.fitting.maximise import gradient_at
 from hsnoise.fitting.notes import near_zero, parameter_notes
 from hsnoise.fitting.result import NOT_CONVERGED, FitResult
 from hsnoise.frames.stack import FrameStack
-from hsnoise.likelihood.coordinates import Coordinates, coordinates_for, labels
-from hsnoise.likelihood.physics import WITH_LIKELIHOOD, Physics, physics_of
+from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
+from hsnoise.likelihood.parameters import Parameters, parameters_of
 from hsnoise.likelihood.plan import plan_rules, replan
 from hsnoise.likelihood.summary import coding_of, summarise, without_counts
 from hsnoise.model import NoiseModel
@@ -57,25 +56,30 @@ class Problem:
     base: FitResult
     model: NoiseModel
     extra: tuple[str, ...]
-    knobs: list[Knob]
     seed: int
     given: NoiseModel
 
     @cached_property
     def coordinates(self) -> Coordinates:
+        """Those of the base fit, without shares of outliers: its likelihood gives the score."""
         with jax.enable_x64(True):
-            return coordinates_for(self.base.summary, self.centre_physics)
+            return coordinates_for(self.base.summary, self.base.params)
+
+    @cached_property
+    def added(self) -> Parameters:
+        """The numbers of the effects that the base fit lacks."""
+        return parameters_of(self.model, self.extra)
 
     @cached_property
     def centre(self) -> np.ndarray:
         with jax.enable_x64(True):
-            return np.asarray(self.coordinates.vector(self.coordinates.base))
+            return np.asarray(self.coordinates.start())
 
     @cached_property
     def sizes(self) -> np.ndarray:
         """What a change of each base coordinate is measured by: as much as doubles the parameter, say."""
         with jax.enable_x64(True):
-            return np.asarray(self.coordinates.sizes(jnp.asarray(self.centre)))
+            return self.coordinates.sizes(self.centre)
 
     @cached_property
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +95,7 @@ class Problem:
 
     def _base_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Covariance of the base fit in the order of the coordinates, and which of these it did not fit."""
-        names, fitted = labels(self.coordinates, self.base.params.channels), self.base.names
+        names, fitted = self.coordinates.names, self.base.names
         covariance = np.diag(np.full(len(names), np.inf))
         here = [i for i, name in enumerate(names) if name in fitted]
         there = [fitted.index(names[i]) for i in here]
@@ -108,7 +112,7 @@ class Problem:
     def prior(self) -> np.ndarray:
         """Inverse variances that keep numbers near the start: of effects, and where the base fit knew nothing."""
         base = np.where(self.spread[0] < MOST_SPREAD, 1e-6, 1.0)
-        return np.concatenate([base, np.full(len(self.knobs), PRIOR_SIGMA**-2)])
+        return np.concatenate([base, np.full(len(self.added.numbers), PRIOR_SIGMA**-2)])
 
     def slope(self, vector: np.ndarray) -> np.ndarray:
         """d parameter / d coordinate of the base."""
@@ -120,58 +124,29 @@ class Problem:
         return coding_of(self.part)
 
     @cached_property
-    def centre_physics(self) -> Physics:
-        """The base fit, without shares of outliers: its likelihood gives the score."""
-        return jax.tree.map(np.asarray, replace(self.base.physics, outliers=None))
-
-    @cached_property
     def rules(self):
-        return plan_rules(self.centre_physics, summarise(self.part, coding=self.coding), MARGIN)
+        return plan_rules(self.coordinates.base, summarise(self.part, coding=self.coding), MARGIN)
 
     @cached_property
     def start(self) -> np.ndarray:
-        return np.concatenate([np.zeros(len(self.centre)), [knob.read(self.model) for knob in self.knobs]])
+        return np.concatenate([np.zeros(len(self.centre)), self.added.read(self.model)])
 
     @cached_property
     def other_start(self) -> np.ndarray | None:
-        """Where the base parameters are those of `model`, which may know more of the effects than `base` did."""
-        own = NoiseModel(
-            [self.given[name] for name in self.base.params.names if name in WITH_LIKELIHOOD],
-            cfa=self.given.cfa,
-            shutter=self.given.shutter,
-            exposure_s=self.given.exposure_s,
-        )
-        with jax.enable_x64(True):
-            vector = np.asarray(self.coordinates.vector(physics_of(own)))
+        """Where the base parameters are those of `given`, which may know more of the effects than `base` did."""
+        vector = self.coordinates.read(self.given)
         if not np.all(np.isfinite(vector)) or np.allclose(vector, self.centre, rtol=1e-6):
             return None
         return np.concatenate([np.linalg.solve(self.whiten, vector - self.centre), self.start[len(vector) :]])
 
-    def physics(self, y: np.ndarray) -> Physics:
+    def base_vector(self, y: np.ndarray) -> np.ndarray:
+        """The coordinates of the base."""
         n = len(self.centre)
-        with jax.enable_x64(True):
-            physics = self.coordinates.physics(jnp.asarray(self.centre + self.whiten @ y[:n]))
-        return jax.tree.map(np.asarray, physics)
+        return self.centre + self.whiten @ y[:n]
 
     def at(self, y: np.ndarray) -> NoiseModel:
         """The model whose numbers are y."""
-        physics, model = self.physics(y), self.model
-        values = {
-            ("gain", "value"): physics.gain,
-            ("dark_current", "rate"): physics.dark_current,
-            ("read_noise", "sigma"): physics.read_noise,
-            ("row_gain", "sigma"): physics.row_sigma,
-            ("row_gain", "exponent"): physics.exponent,
-            ("row_gain", "white_share"): physics.white_share,
-            ("black_level", "value"): physics.black_level,
-            ("black_clamp", "rate"): None if physics.black_clamp is None else np.maximum(physics.black_clamp, 0),
-        }
-        for (name, field), value in values.items():
-            if name in model and value is not None:
-                model = model.with_value(name, field, value)
-        for knob, x in zip(self.knobs, y[len(self.centre) :], strict=True):
-            model = knob.put(model, x)
-        return model
+        return self.added.put(self.coordinates.put(self.model, self.base_vector(y)), y[len(self.centre) :])
 
     def in_float64(self, y: np.ndarray) -> NoiseModel:
         with jax.enable_x64(True):
@@ -182,7 +157,7 @@ class Problem:
         found = structure(part, black_level_of(self.base.params))
         summary = summarise(part, coding=self.coding)
         with jax.enable_x64(True):
-            rules = replan(self.rules, plan_rules(self.centre_physics, summary, MARGIN))
+            rules = replan(self.rules, plan_rules(self.coordinates.base, summary, MARGIN))
             _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
             score = self.whiten.T @ np.asarray(gradient)
         return np.concatenate([score, found.values]), np.concatenate([np.full(len(score), 0.3), found.error])
@@ -207,7 +182,7 @@ def fit_synthetic(base: FitResult, stack: FrameStack, model: NoiseModel, *, seed
     part, tick = part_of(stack), progress or (lambda: None)
     extra = tuple(name for name in model.names if name not in base.params)
     whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
-    problem = Problem(part, base, whole, extra, knobs(whole, extra), seed, model)
+    problem = Problem(part, base, whole, extra, seed, model)
     return _result(problem, *_search(problem, tick))
 
 
@@ -292,23 +267,25 @@ def _first(problem: Problem, point) -> _Point:
 
 
 def _not_finite(problem: Problem, y: np.ndarray) -> str:
-    at = [f"{k.label} {k.inverse(x):.3g}" for k, x in zip(problem.knobs, y[len(problem.centre) :], strict=True)]
+    with jax.enable_x64(True):
+        values = np.asarray(problem.added.values(y[len(problem.centre) :]))
+    at = [f"{name} {value:.3g}" for name, value in zip(problem.added.names, values, strict=True)]
     return f"statistics of draws are not finite at {', '.join(at)}; fit from another start"
 
 
 def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float, iterations: int) -> FitResult:
     n, base = len(problem.centre), problem.base
-    coordinate = problem.centre + problem.whiten @ y[:n]
     turn = np.zeros((len(y), len(y)))
-    turn[:n, :n] = problem.slope(coordinate)[:, None] * problem.whiten
-    turn[range(n, len(y)), range(n, len(y))] = [k.slope(x) for k, x in zip(problem.knobs, y[n:], strict=True)]
+    turn[:n, :n] = problem.slope(problem.base_vector(y))[:, None] * problem.whiten
+    with jax.enable_x64(True):
+        turn[range(n, len(y)), range(n, len(y))] = np.asarray(problem.added.slope(jnp.asarray(y[n:])))
     of_base = "" if base.method == "ml" else f"; of the fit that it starts from: {base.outcome}"
     met = "simulated statistics met" if last_step < LONG_STEP else f"{NOT_CONVERGED}simulated statistics not met"
     result = replace(
         base,
         params=problem.in_float64(y),
-        physics=problem.physics(y),
-        names=(*base.names, *(knob.label for knob in problem.knobs)),
+        outliers=None,
+        names=(*base.names, *problem.added.names),
         covariance=not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
         method="synthetic",
         outcome=f"{met}: the last step was {last_step:.1g} standard errors long{of_base}",
@@ -322,10 +299,9 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
 
 
 def _in_order(problem: Problem, covariance: np.ndarray) -> np.ndarray:
-    """`covariance` of coordinates and knobs in the order of the table; what the base fit measured keeps its own."""
-    base, knobs_ = problem.base, [knob.label for knob in problem.knobs]
-    moved = [*labels(problem.coordinates, base.params.channels), *knobs_]
-    names = [*base.names, *knobs_]
+    """`covariance` of all numbers that moved in the order of the table; what the base fit measured keeps its own."""
+    base, added = problem.base, problem.added.names
+    moved, names = [*problem.coordinates.names, *added], [*base.names, *added]
     whole = np.zeros((len(names), len(names)))
     whole[: len(base.names), : len(base.names)] = base.covariance
     here = [i for i, name in enumerate(names) if name in moved]
@@ -339,16 +315,14 @@ def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[
     """Sentences on numbers of effects that hardly moved from where the search started; covariance: of y."""
     deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
     told = []
-    for knob, sigma in zip(problem.knobs, deviation, strict=True):
+    for name, sigma in zip(problem.added.names, deviation, strict=True):
         if sigma <= 0.7 * PRIOR_SIGMA:
             continue
-        value, error, unit = result.table[knob.label]
+        value, error, unit = result.table[name]
         if value < 2 * error:
-            told.append(f"{near_zero(knob.label, value, error, unit_in_words(unit))}.")
+            told.append(f"{near_zero(name, value, error, unit_in_words(unit))}.")
         else:
-            told.append(
-                f"{knob.label} is not determined by this capture: its value is close to where the search started."
-            )
+            told.append(f"{name} is not determined by this capture: its value is close to where the search started.")
     return told
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hsnoise.likelihood.darks import black_level_at, dark_current, flat_gain_of
 from hsnoise.likelihood.flat_gain import FlatGain, local_gain, variance_curve
 from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.likelihood.moments import binned_moments
-from hsnoise.likelihood.physics import Physics, black_level_at, flat_gain_of
 from hsnoise.likelihood.summary import RowHistograms, Summary, far_outliers
+from hsnoise.model import NoiseModel
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, plain_log, tidy, title_of
@@ -60,14 +61,14 @@ def has_photon_transfer(fit) -> bool:
 
 
 def _panels(fit) -> list[Callable[[Axes], None]]:
-    summary, physics = fit.summary, fit.physics
+    summary, model = fit.summary, fit.params
     panels: list[Callable[[Axes], None]] = []
     if transfers_of(fit):
         panels.append(partial(_classes, fit=fit))
     elif fit.transfer is None and summary.histograms:
-        panels.append(partial(_darks, physics=physics, summary=summary))
+        panels.append(partial(_darks, model=model, summary=summary))
     if summary.flats is not None and summary.flats.mean_dn.size:
-        panels += [partial(draw, physics=physics, summary=summary) for draw in (_flats, _gains)]
+        panels += [partial(draw, model=model, summary=summary) for draw in (_flats, _gains)]
     return panels
 
 
@@ -78,23 +79,23 @@ def _classes(axes: Axes, fit) -> None:
     axes.set_xlabel("dark signal / DN")
 
 
-def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
+def _darks(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     axes.set_title("dark frames, one point per exposure", fontsize=10)
     axes.set_ylabel("variance within rows / DN²")
     far = far_outliers(summary) > 0
     t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
-        channel, black = histograms.channel, black_level_at(physics, summary.exposure_s)[:, c]
+        channel, black = histograms.channel, black_level_at(model, summary.exposure_s)[:, c]
         colour = COLOURS[channel]
         mean, variance, error = _within_rows(histograms, far & ~_reaches_white(histograms, summary.white_level_dn))
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION
         _points(axes, channel, mean - black, variance, clipped, error)
-        x, y = _expected(physics, c, t, summary.white_level_dn)
+        x, y = _expected(model, c, t, summary.white_level_dn)
         axes.plot(x, y, linewidth=1.6, color=colour)
         if clipped.any():
             any_clipped = True
-            axes.plot(*_unclipped(physics, c, t), "--", linewidth=1.2, color=colour)
+            axes.plot(*_unclipped(model, c, t), "--", linewidth=1.2, color=colour)
     axes.plot([], [], "-", color="0.3", label="fitted model")
     if any_clipped:
         axes.plot([], [], "--", color="0.3", label="fitted, before clipping")
@@ -103,18 +104,18 @@ def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.legend(fontsize=9, framealpha=0.9)
 
 
-def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
+def _flats(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     axes.set_title("flat frames, one point per level", fontsize=10)
     axes.set_ylabel("variance above that of darks / DN²")
-    found = flat_gain_of(physics, summary.flats)
+    found = flat_gain_of(model, summary.flats)
     for c, channel in enumerate(summary.channels):
         signal, shown = _levels(found, c)
         gain, error = found.level_gain[shown, c], found.level_error[shown, c]
         _points(axes, channel, signal, gain * signal, ~found.used[shown, c], error * signal)
         if len(signal):
             light_dn = np.geomspace(signal.min() / 2, signal.max() * 1.5, CURVE_POINTS)
-            expected = float(physics.gain[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
-            axes.plot(light_dn, expected * (1 + _row_sigma(physics, c) ** 2), color=COLOURS[channel], linewidth=1.6)
+            expected = float(model["gain"].value[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
+            axes.plot(light_dn, expected * (1 + _row_sigma(model, c) ** 2), color=COLOURS[channel], linewidth=1.6)
     axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -123,11 +124,11 @@ def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.legend(fontsize=9, framealpha=0.9)
 
 
-def _gains(axes: Axes, physics: Physics, summary: Summary) -> None:
+def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     """Variance over signal of the flats and the local gain: level where the response is straight."""
     axes.set_title("flat frames: gain against signal", fontsize=10)
     axes.set_ylabel("variance over signal, gain / (DN/e$^-$)")
-    found = flat_gain_of(physics, summary.flats)
+    found = flat_gain_of(model, summary.flats)
     for c, channel in enumerate(summary.channels):
         signal, shown = _levels(found, c)
         used = found.used[shown, c]
@@ -204,23 +205,23 @@ def clipped_fraction(histograms: RowHistograms, white_level_dn: float | None) ->
     return (at_zero + np.where(_reaches_white(histograms, white_level_dn), counts[:, -1], 0.0)) / counts.sum(1)
 
 
-def _expected(physics: Physics, c: int, exposure_s, white_level_dn: float | None):
+def _expected(model: NoiseModel, c: int, exposure_s, white_level_dn: float | None):
     """Mean above black and variance within rows of the recorded counts, averaged over the row gain; [exposure]."""
-    beta, weight = beta_rule(_row_sigma(physics, c))
-    mean, variance = count_moments(physics, c, exposure_s, beta, white_level_dn)
+    beta, weight = beta_rule(_row_sigma(model, c))
+    mean, variance = count_moments(model, c, exposure_s, beta, white_level_dn)
     return mean @ weight, variance @ weight
 
 
-def _unclipped(physics: Physics, c: int, exposure_s):
+def _unclipped(model: NoiseModel, c: int, exposure_s):
     """Mean above black and variance within rows of counts that nothing clips."""
-    signal = float(physics.gain[c]) * float(physics.dark_current) * exposure_s
-    return signal, _line(physics, c, signal)
+    signal = float(model["gain"].value[c]) * float(dark_current(model)) * exposure_s
+    return signal, _line(model, c, signal)
 
 
-def _line(physics: Physics, c: int, signal_dn):
-    gain, read_noise_e = float(physics.gain[c]), float(physics.read_noise)
-    return (gain * signal_dn + (gain * read_noise_e) ** 2) * (1 + _row_sigma(physics, c) ** 2) + ROUNDING_VARIANCE
+def _line(model: NoiseModel, c: int, signal_dn):
+    gain, read_noise_e = float(model["gain"].value[c]), float(model["read_noise"].sigma)
+    return (gain * signal_dn + (gain * read_noise_e) ** 2) * (1 + _row_sigma(model, c) ** 2) + ROUNDING_VARIANCE
 
 
-def _row_sigma(physics: Physics, c: int) -> float:
-    return 0.0 if physics.row_sigma is None else float(physics.row_sigma[c])
+def _row_sigma(model: NoiseModel, c: int) -> float:
+    return float(model["row_gain"].sigma[c]) if "row_gain" in model else 0.0

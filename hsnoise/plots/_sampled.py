@@ -9,6 +9,7 @@ from matplotlib.ticker import NullLocator
 
 from hsnoise._core.types import cfa_tile, seconds
 from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.darks import black_level
 from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
 from hsnoise.simulation.draws import draw_capture, middle_of
 from hsnoise.statistics.pixels.classes import growth_noise, levels_of, slope_over
@@ -77,7 +78,7 @@ def _growths(stack: FrameStack) -> list[np.ndarray]:
 
 def _unit(fit) -> tuple[np.ndarray, str]:
     """What to divide by [channel], and the unit: electrons where the gain is known."""
-    gain = np.asarray(fit.physics.gain)
+    gain = np.asarray(fit.params["gain"].value)
     known = fit.has_gain
     return (gain, "e$^-$/s") if known else (np.ones_like(gain), "DN/s")
 
@@ -111,7 +112,7 @@ def sampled_histograms(fit) -> Figure:
     title = "Counts of the dark frames: measured, and sampled from the fit"
     figure = new_figure(max(4.3 * columns, 6.4), 3.1 * len(shown) + 0.5, title)
     grid = figure.subplots(2 * len(shown), columns, squeeze=False, gridspec_kw={"height_ratios": [3, 1.2] * len(shown)})
-    black = np.broadcast_to(np.asarray(fit.physics.black_level), columns)
+    black = np.asarray(black_level(fit.params))
     for i, e in enumerate(shown):
         for c, name in enumerate(part.channels):
             top, strip = grid[2 * i, c], grid[2 * i + 1, c]
