@@ -8,25 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import jax
 import numpy as np
 
 from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
-from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, draw_capture, light_of
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.structure import code_step, moving_line, places
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
-LINE_SEEDS = range(7000, 7006)  # of draws without lines of their own
+LINE_DRAWS = 6  # without lines of their own
 
 Suspect = AbstractEffect | type[AbstractEffect]  # what a user may offer
 
 
-def facts_of(model: NoiseModel, part: FrameStack) -> CaptureFacts:
+def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
     """What effects ask of a capture, and of the model that was fitted to it, to propose themselves."""
+    part = portion.frames
     darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
     exposures_s = {float(part.exposure_s[i]) for i in darks}
     longest = max(exposures_s)
+    key = key_for(seed, Purpose.LINES)
+    drawn = [draw_capture(jax.random.fold_in(key, number), model, part) for number in range(LINE_DRAWS)]
     return CaptureFacts(
         effects=model.names,
         cfa=model.cfa,
@@ -41,7 +46,7 @@ def facts_of(model: NoiseModel, part: FrameStack) -> CaptureFacts:
         exposures_differ=len(exposures_s) > 1,
         levels=len(exposures_s) + part.n_exposures - len(darks),
         light_e=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
-        line=moving_line(part, [draw_capture(s, model, part) for s in LINE_SEEDS], black_level_of(model)),
+        line=moving_line(part, drawn, black_level_of(model)),
         places=places(part),
         code_step=code_step(part),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,13 +16,14 @@ from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
 from hsnoise._core.threads import in_threads
-from hsnoise.criticism.reference import measure, misfits, reference
 from hsnoise.fitting.result import number
 from hsnoise.frames.source import as_stack
-from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.joint import log_likelihood
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, darks_of, part_of
+from hsnoise.simulation.draws import check_effects, check_fits
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.reference import misfits
+from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import explained
 
 DRAWS = 40
@@ -146,13 +148,20 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
-    part = part_of(stack)
-    check_effects(params, part)
-    measured = measure(part, params)
+    portion = Portion.of(stack)
+    check_effects(params, portion.frames)
+    return compared(params, portion, draws=draws, seed=seed, tick=tick)
+
+
+def compared(
+    params: NoiseModel, portion: Portion, *, draws: int = DRAWS, seed: int, tick: Callable[[], None] = lambda: None
+) -> Comparison:
+    """What `compare` finds on a portion that is checked."""
+    simulator = Simulator(params, portion, key_for(seed, Purpose.COMPARE), tick)
     own, per_pixel = in_threads(  # the likelihood is compiled while captures are drawn
-        lambda work: work(),
-        [lambda: reference(params, part, draws, seed, tick), lambda: _per_pixel(params, part)],
+        lambda work: work(), [lambda: simulator.reference(params, draws), lambda: _per_pixel(params, portion.darks)]
     )
+    measured = simulator.measured
     z = own.z(measured.values)
     groups = misfits(z, own.groups)
     worst = max(groups.values())
@@ -165,16 +174,8 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
         log_likelihood_per_pixel=per_pixel,
-        skipped=(*measured.skipped, *_left_out(stack, part)),
+        skipped=(*measured.skipped, *portion.left_out),
     )
-
-
-def _left_out(stack: FrameStack, part: FrameStack) -> tuple[str, ...]:
-    """What of a large capture was not looked at."""
-    if part.window is None or part.shape == stack.shape:
-        return ()
-    first = part.window[1] - (0 if stack.window is None else stack.window[1])
-    return (f"only columns {first} to {first + part.shape[1] - 1} of {stack.shape[1]} were compared: large capture",)
 
 
 def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
@@ -202,10 +203,10 @@ def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
     )
 
 
-def _per_pixel(params: NoiseModel, part: FrameStack) -> float:
-    darks = darks_of(part)
+def _per_pixel(params: NoiseModel, darks: Portion) -> float:
+    frames = darks.frames
     try:
-        value = float(log_likelihood(params, darks))
+        value = float(log_likelihood(params, frames))
     except ValueError:  # an effect that states no likelihood
         return float("nan")
-    return value / (sum(darks.n_frames) * darks.shape[0] * darks.shape[1])
+    return value / (sum(frames.n_frames) * frames.shape[0] * frames.shape[1])

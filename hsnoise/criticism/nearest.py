@@ -15,7 +15,7 @@ import numpy as np
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.ranking import GRID, Candidate, Evidence
-from hsnoise.criticism.reference import misfits
+from hsnoise.simulation.reference import misfits
 
 FREEDOM = 4.0
 ITERATIONS = 10
