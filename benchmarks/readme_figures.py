@@ -21,7 +21,8 @@ from hsnoise import plots
 from hsnoise._core.output import write_figure
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import darks_of, draw_capture
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 
 ROWS, COLUMNS = slice(10, 190), slice(20, 290)  # of the frames that are shown
 STRETCH = (0.5, 99.9)  # percentiles of the measured frame that are black and white
@@ -39,7 +40,7 @@ def textbook(stack: FrameStack, gain: float) -> NoiseModel:
 
 def hero(stack: FrameStack, model: NoiseModel) -> Figure:
     """The mean of the longest darks, that of the textbook and of the fitted model, and below each its column means."""
-    darks = darks_of(stack)
+    darks = Portion.of(stack).darks.frames
     plain = textbook(darks, float(np.asarray(model["gain"].value).ravel()[0]))
     drawn = (darks, draw_capture(1, plain, darks), draw_capture(1, model, darks))
     means = [np.mean(list(of.frames(len(of.counts) - 1)), axis=0, dtype=float) for of in drawn]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
@@ -15,7 +16,7 @@ from hsnoise.fitting.notes import closing_notes, outlier_fraction
 from hsnoise.fitting.pixel_fit import measure
 from hsnoise.fitting.pixel_result import POPULATION, result_of
 from hsnoise.fitting.profile import profile_errors
-from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.mosaics import warn_of_a_mosaic
@@ -27,7 +28,8 @@ from hsnoise.likelihood.moments import start_model
 from hsnoise.likelihood.parameters import within_bounds
 from hsnoise.likelihood.summary import Summary, far_outliers, summarise
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, part_of
+from hsnoise.simulation.draws import check_effects, check_fits
+from hsnoise.simulation.portion import Portion
 from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ
 from hsnoise.statistics.pixels.survey import Survey, survey
 
@@ -96,7 +98,7 @@ def fit(
     if pixels not in PIXELS:
         raise ValueError(f"pixels: expected one of {', '.join(PIXELS)}, got {pixels!r}")
     if model is not None and not isinstance(model, NoiseModel):
-        raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
+        raise TypeError(f"{named('model')}: expected a NoiseModel, got {type(model).__name__}")
     source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
     if isinstance(source, Summary) and (method == "transfer" or pixels == "differ"):
         raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")
@@ -140,7 +142,8 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
-            "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
+            f"{named('black_level')}: flats alone do not tell the black level from read noise; give"
+            f" {named('black_level')} or add dark frames"
         )
     with jax.enable_x64(True):
         start = start_model(summary, with_row_gain, with_clamp)
@@ -151,7 +154,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
             start = start.with_value("row_gain", "white_share", white_share)
             start = start if white_share < 1 else start.with_value("row_gain", "exponent", 0.0)
         if method == "line":
-            return _by_line(summary, model, "the paper's line fit, as asked")
+            return _by_line(summary, model, Status.LINE)
         log.info("Maximising the likelihood of rows, pixels pooled")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
         outside = far_outliers(summary)
@@ -162,10 +165,9 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
                 result, converged = _by_likelihood(summary, model, start, _set_apart(outside))
         if converged:
             return result
-        why = result.outcome.removeprefix(NOT_CONVERGED)
         if method == "ml" or with_clamp or white_share is not None:
-            raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
-        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+            raise RuntimeError(f"fit: maximum likelihood did not converge: {result.detail}")
+        return _by_line(summary, model, Status.LINE_INSTEAD, result.detail)
 
 
 def _with_judged_flats(summary: Summary, start: NoiseModel) -> Summary:
@@ -184,14 +186,14 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
     """A fit of the base effects, then of all together by simulated statistics."""
     if isinstance(stack, Summary):
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
-    part = part_of(stack)
-    check_effects(model, part)
+    portion = Portion.of(stack)
+    check_effects(model, portion.frames)
     log.info("Effects beyond the paper's, by simulated statistics after a fit of the others: %s", ", ".join(extra))
     bare = model
     for name in extra:
         bare = bare.remove(name)
     base = fit(stack, model=bare, method=method, pixels=pixels, progress=progress)
-    return fit_synthetic(base, part, model)
+    return fit_synthetic(base, portion, model)
 
 
 def rechecked(result: FitResult, stack) -> FitResult:
@@ -256,7 +258,7 @@ def _check_complete(model: NoiseModel) -> None:
     """Raise ValueError for a model without the effects that every fit has."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
-        raise ValueError(f"model: has no {', '.join(missing)}, without which it cannot be fitted")
+        raise ValueError(f"{named('model')}: has no {', '.join(missing)}, without which it cannot be fitted")
 
 
 def _white_share(model: NoiseModel | None) -> np.ndarray | None:
@@ -271,7 +273,9 @@ def _check_clamp(summary: Summary, method: str) -> None:
     if method == "line":
         raise ValueError("method: the line fit takes the means for the dark signal, which black_clamp hides; use ml")
     if not summary.histograms or np.ptp(summary.exposure_s) == 0:
-        raise ValueError("model: black_clamp shows in darks of two or more exposures only, which this stack has not")
+        raise ValueError(
+            f"{named('model')}: black_clamp shows in darks of two or more exposures only, which this stack has not"
+        )
 
 
 def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tuple[FitResult, bool]:
@@ -294,8 +298,9 @@ def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tupl
         outliers=maximum.outliers,
         names=tuple(coordinates.names[i] for i in kept),
         covariance=covariance[np.ix_(kept, kept)],
-        method="ml",
-        outcome=("converged: " if maximum.converged else NOT_CONVERGED) + maximum.outcome,
+        method=Method.ML,
+        status=Status.CONVERGED if maximum.converged else Status.NOT_CONVERGED,
+        detail=maximum.outcome,
         iterations=maximum.iterations,
         log_likelihood=maximum.log_likelihood,
         notes=(),
@@ -337,16 +342,17 @@ def _of_hidden_dark_level(
     return np.outer(moved, moved)
 
 
-def _by_line(summary: Summary, model, outcome: str) -> FitResult:
-    log.info("Line fit: %s", outcome)
+def _by_line(summary: Summary, model, status: Status, detail: str = "") -> FitResult:
+    log.info("Line fit: %s", status)
     line = line_fit(summary)
     names = coordinates_for(summary, line.params).names
     result = FitResult(
         params=_fitted(line.params, model, line.params.exposure_s),
         names=names,
         covariance=np.diag([line.standard_errors[name] ** 2 for name in names]),
-        method="line",
-        outcome=outcome,
+        method=Method.LINE,
+        status=status,
+        detail=detail,
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),

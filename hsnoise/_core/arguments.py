@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import Window
 
 MOST_SEED = 2**31  # those of single draws are counted from it
@@ -30,14 +30,14 @@ def span(name: str, value: Any, size: int) -> slice:
         )
         if 0 <= start < stop <= size:
             return slice(start, stop)
-    raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
+    raise ValueError(f"{named(name)}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
 
 
 def seed_of(name: str, value: Any) -> int:
     """A seed of random draws. Raises TypeError for what is no whole number, ValueError outside 0 to MOST_SEED."""
     seed = whole_number(name, value, 0)
     if seed > MOST_SEED:
-        raise ValueError(f"{name}: expected at most {MOST_SEED}, got {value}")
+        raise ValueError(f"{named(name)}: expected at most {MOST_SEED}, got {value}")
     return seed
 
 
@@ -46,30 +46,24 @@ def whole_number(name: str, value: Any, least: int | None = None) -> int:
     try:
         number = operator.index(value)
     except TypeError:
-        raise TypeError(f"{name}: expected a whole number, got {value!r}") from None
+        raise TypeError(f"{named(name)}: expected a whole number, got {value!r}") from None
     if least is not None and number < least:
-        raise ValueError(f"{name}: expected at least {least}, got {value}")
+        raise ValueError(f"{named(name)}: expected at least {least}, got {value}")
     return number
 
 
 def listed(name: str, value: Any, expected: str) -> tuple[Any, ...]:
     """`value` as a tuple. Raises TypeError for what is no list."""
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise TypeError(f"{name}: expected {expected}, got {value!r}")
+        raise TypeError(f"{named(name)}: expected {expected}, got {value!r}")
     return tuple(value)
 
 
 def callback(name: str, function: Any) -> Callable[..., Any]:
     """A user's function, or for None one that does nothing. Raises TypeError for what cannot be called."""
     if function is not None and not callable(function):
-        raise TypeError(f"{name}: expected a function or None, got {function!r}")
+        raise TypeError(f"{named(name)}: expected a function or None, got {function!r}")
     return function or (lambda *told: None)
-
-
-def counter(say: Callable[[str], Any], text: str, total: int | None = None) -> Callable[[], None]:
-    """A function that says `text` and how often it was called: "Drawing: 12", "Drawing: 12 of 40"."""
-    numbers, of = itertools.count(1), "" if total is None else f" of {total}"
-    return lambda: say(f"{text}: {next(numbers)}{of}")
 
 
 def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
@@ -88,7 +82,7 @@ def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
 def one_of(name: str, value: Any, allowed: Sequence[Any]) -> Any:
     """The value, if it is one of those allowed."""
     if not isinstance(value, type(allowed[0])) or value not in allowed:
-        raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {value!r}")
+        raise ValueError(f"{named(name)}: expected one of {', '.join(map(repr, allowed))}, got {value!r}")
     return value
 
 
@@ -97,9 +91,9 @@ def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
     try:
         array = np.atleast_1d(np.array(value, np.float64))
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name}: expected numbers, got {value!r}") from error
+        raise TypeError(f"{named(name)}: expected numbers, got {value!r}") from error
     if array.shape != (length,):
-        raise ValueError(f"{name}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
+        raise ValueError(f"{named(name)}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
     array.setflags(write=False)
     return array
 
@@ -107,7 +101,7 @@ def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
 def not_negative(name: str, values: np.ndarray) -> np.ndarray:
     """The values, if all are finite and none is negative."""
     if not np.isfinite(values).all() or (values < 0).any():
-        raise ValueError(f"{name}: expected finite numbers >= 0, got {values.tolist()}")
+        raise ValueError(f"{named(name)}: expected finite numbers >= 0, got {values.tolist()}")
     return values
 
 
@@ -115,5 +109,5 @@ def positive(name: str, value: Any) -> float:
     """One finite number > 0 as a float."""
     number = float(not_negative(name, numbers(name, value, 1, "stack"))[0])
     if number == 0:
-        raise ValueError(f"{name}: expected a number > 0, got {value!r}")
+        raise ValueError(f"{named(name)}: expected a number > 0, got {value!r}")
     return number

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import RandomKey, is_traced
 
 LARGEST_SEED = 2**32 - 1  # of larger ones JAX takes the lower 32 bits, unless it has 64
@@ -30,7 +31,9 @@ def key_of(name: str, value: Any) -> RandomKey:
     if is_traced(value) and shape == () and jnp.issubdtype(dtype, jnp.integer):
         return jax.random.key(value)
     seed = _whole(value) if shape in (None, ()) and not is_traced(value) else None
-    expected = f"{name}: expected a whole number from 0 to {LARGEST_SEED} or one random key, such as jax.random.key(0)"
+    expected = (
+        f"{named(name)}: expected a whole number from 0 to {LARGEST_SEED} or one random key, such as jax.random.key(0)"
+    )
     if seed is None:
         came = repr(value) if dtype is None else f"an array of {dtype} of shape {shape}"
         raise TypeError(f"{expected}, got {came}")

@@ -12,6 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt, UInt32
 
+from hsnoise._core.naming import named
+
 Scalar = Float[Array, ""]
 PerChannel = Float[Array, "*channel"]  # a scalar until the model spreads it over its channels
 Frames = Float[Array, "frame row column"]
@@ -61,7 +63,7 @@ def channels_of(cfa: str) -> tuple[str, ...]:
         return ("mono",)
     if cfa in BAYER_CFAS:
         return ("R", "G", "B")
-    raise ValueError(f"cfa: expected 'mono' or one of {', '.join(BAYER_CFAS)}, got {cfa!r}.")
+    raise ValueError(f"{named('cfa')}: expected 'mono' or one of {', '.join(BAYER_CFAS)}, got {cfa!r}.")
 
 
 def cfa_tile(cfa: str) -> np.ndarray:
@@ -75,7 +77,7 @@ def cfa_tile(cfa: str) -> np.ndarray:
 def check_shutter(shutter: str) -> None:
     """Raise ValueError unless `shutter` is "rolling" or "global"."""
     if shutter not in SHUTTERS:
-        raise ValueError(f"shutter: expected 'rolling' or 'global', got {shutter!r}.")
+        raise ValueError(f"{named('shutter')}: expected 'rolling' or 'global', got {shutter!r}.")
 
 
 def is_traced(x) -> bool:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.arguments import listed, window_of
+from hsnoise._core.naming import named
 from hsnoise._core.types import cfa_tile, is_traced
 
 
@@ -49,7 +50,7 @@ def checked_light(clean, cfa: str):
 def checked_exposure(exposure_s):
     """The exposure in seconds, one number >= 0."""
     if np.ndim(exposure_s) != 0:
-        raise ValueError(f"exposure_s: expected one number of seconds, got shape {np.shape(exposure_s)}.")
+        raise ValueError(f"{named('exposure_s')}: expected one number of seconds, got shape {np.shape(exposure_s)}.")
     if not is_traced(exposure_s) and not 0 <= float(exposure_s) < np.inf:
-        raise ValueError(f"exposure_s: expected finite seconds >= 0, got {exposure_s}.")
+        raise ValueError(f"{named('exposure_s')}: expected finite seconds >= 0, got {exposure_s}.")
     return exposure_s

@@ -24,9 +24,10 @@ from hsnoise.simulation import cameras
 EXPOSURES_S, FRAMES, SHAPE, SEED = (0.05, 0.1, 0.2, 0.4), 8, (96, 160), 0
 HIDDEN = RowNoise(1.5)
 MINUTES = 5.0  # for frames of a user's own
-OFF_BY = """\
-off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read
-noise are off together: their ratios are known better than themselves."""
+OFF_BY = (
+    "off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read",
+    "noise are off together: their ratios are known better than themselves.",
+)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -75,7 +76,7 @@ def _improved(
     write_figure(args.out / "story.png", story.plot())
     report.write_report(page, story, stack, files=source.get("files", ()), seed=SEED)
     if truth is not None:
-        foot = [*OFF_BY.splitlines(), *foot]
+        foot = [*OFF_BY, *foot]
         foot.append(f"Hidden in these frames was {HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
     foot.append(f"All of this is on one page, with figures, for a browser: {page}")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"

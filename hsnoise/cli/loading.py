@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-import hsnoise.frames.io
+from hsnoise._core.naming import as_options, named
 from hsnoise._core.parsing import or_near
 from hsnoise.cli.options import CAMERAS
+from hsnoise.frames.io.load import load
 from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -34,10 +35,8 @@ def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
         for group in groups:
             _tell_exposures(group)
     if args.flats:
-        try:
+        with as_options({"path": "--flats", "exposure_s": "--flats-exposure"}):
             groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"--flats: {str(error).removeprefix('path: ')}") from error
     return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
 
 
@@ -75,8 +74,8 @@ def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
     """Several files or folders are one capture; several patterns, or folders with exposures of their own, one each."""
     is_one = all(Path(path).exists() for path in paths) and np.ndim(options["exposure_s"]) == 0
     if len(paths) > 1 and (is_one or all(Path(path).is_file() for path in paths)):
-        return [hsnoise.io.load(paths, **options)]
-    return [hsnoise.io.load(path, **options) for path in paths]
+        return [load(paths, **options)]
+    return [load(path, **options) for path in paths]
 
 
 def model_of(name: str, argument: str = "model") -> NoiseModel:
@@ -85,7 +84,7 @@ def model_of(name: str, argument: str = "model") -> NoiseModel:
         return CAMERAS[name]()
     if not Path(name).is_file():
         expected = f"expected a model.json or one of {', '.join(CAMERAS)}"
-        raise ValueError(f"{argument}: {expected}, and there is no {name}{or_near(name, CAMERAS)}")
+        raise ValueError(f"{named(argument)}: {expected}, and there is no {name}{or_near(name, CAMERAS)}")
     return NoiseModel.load(name)
 
 

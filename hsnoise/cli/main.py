@@ -13,7 +13,8 @@ from rich.console import Console
 import hsnoise
 from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
-from hsnoise._core.arguments import counter
+from hsnoise._core.events import Event, counter
+from hsnoise._core.naming import as_options
 from hsnoise._core.output import write_figure
 from hsnoise.cli import demo as _demo
 from hsnoise.cli import enhance as _enhance
@@ -24,7 +25,6 @@ from hsnoise.cli.progress import busy, fit_with_progress
 from hsnoise.cli.results import check_folder, improve_with_progress, keep, write_results
 from hsnoise.cli.telling import (
     Page,
-    in_options,
     page_of_comparison,
     page_of_diagnosis,
     page_of_fit,
@@ -34,8 +34,10 @@ from hsnoise.cli.telling import (
 )
 from hsnoise.criticism import Comparison
 from hsnoise.criticism.compare import DRAWS
+from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
-from hsnoise.simulation.draws import check_fits, part_of
+from hsnoise.simulation.draws import check_fits
+from hsnoise.simulation.portion import Portion
 
 MEANING = """\
 One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
@@ -43,8 +45,24 @@ reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew
 `row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
 errors do not say: whether the model is right."""
 ASSUMED = 4  # sentences on the capture that are told before the work
-LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}")
-LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
+LOOK = dict.fromkeys(Method, "Look at the residuals in histograms.png, and run {}")
+LOOK[Method.SYNTHETIC] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
+# Arguments of the library, and what its sentences call them here.
+OPTIONS = {
+    "exposure_s": "--exposure",
+    "black_level": "--black-level",
+    "white_level": "--white-level",
+    "cfa": "--cfa",
+    "roi": "--roi",
+    "overscan": "--overscan",
+    "shutter": "--shutter",
+    "kind": "--kind",
+    "flats": "--flats",
+    "report": "--report",
+    "model": "--model",
+    "params": "--model",
+    "seed": "--seed",
+}
 BROKEN_PIPE = 128 + 13  # as a shell has it of those whom SIGPIPE ended
 
 
@@ -77,10 +95,10 @@ def _run(argv: list[str] | None) -> int:
         return 2
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), as_options(OPTIONS):
             warnings.simplefilter("once")
             warnings.showwarning = lambda message, *_, **__: console.print(
-                f"Note: {in_options(str(message))}.", style="yellow", markup=False
+                f"Note: {message}.", style="yellow", markup=False
             )
             return RUN[args.command](args) or 0
     except BrokenPipeError:
@@ -95,7 +113,7 @@ def _run(argv: list[str] | None) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return in_options(" ".join(str(error).split()))
+    return " ".join(str(error).split())
 
 
 # Commands
@@ -104,7 +122,7 @@ def _sentence(error: Exception) -> str:
 def _inspect(args: argparse.Namespace) -> int:
     stack = load_capture(args.paths, args)
     with busy("Looking at the frames", of="frame") as say:
-        found = hsnoise.inspect(stack, progress=counter(say, "Looking at the frames"))
+        found = hsnoise.inspect(stack, progress=counter(say, Event("Looking at the frames")))
     tell(page_of_inspection(found), verbose=args.verbose)
     return 0 if found.fit_makes_sense else 1
 
@@ -135,12 +153,12 @@ def _compare(args: argparse.Namespace) -> None:
 def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args)
-    part_of(stack)  # flats alone are no capture to diagnose: said before the fit
+    Portion.of(stack)  # flats alone are no capture to diagnose: said before the fit
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = fit_with_progress(stack, args.method) if args.model is None else model_of(args.model)
     text = "Drawing every effect that may be missing"
     with busy(text) as say:
-        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, text))
+        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, Event(text)))
     more: dict[str, Any] = {"fit": fitted}
     if args.report is not None:
         more["comparison"] = _compared(getattr(fitted, "params", fitted), stack, args.seed)
@@ -167,7 +185,7 @@ def _load(args: argparse.Namespace) -> FrameStack:
     stack.check()
     shown = stack.assumed if args.verbose else stack.assumed[:ASSUMED]
     for sentence in shown:
-        print(f"- {in_options(sentence)}", file=sys.stderr)
+        print(f"- {sentence}", file=sys.stderr)
     if len(stack.assumed) > len(shown):
         print(f"- {len(stack.assumed) - len(shown)} more assumptions: --verbose", file=sys.stderr)
     return stack
@@ -176,7 +194,7 @@ def _load(args: argparse.Namespace) -> FrameStack:
 def _compared(model, stack: FrameStack, seed: int) -> Comparison:
     text = "Drawing from the model"
     with busy(text) as say:
-        return hsnoise.compare(model, stack, seed=seed, progress=counter(say, text, DRAWS))
+        return hsnoise.compare(model, stack, seed=seed, progress=counter(say, Event(text), DRAWS))
 
 
 def _show(

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise import criticism, report
+from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise.cli.progress import busy
 from hsnoise.criticism import Story
+from hsnoise.criticism.improve import improved
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -41,7 +42,7 @@ def improve_with_progress(
             report.write_report(page, story, stack, files=source.get("files", ()), seed=seed)
 
     with busy("Fitting the first model", limits.get("max_minutes")) as say:
-        return criticism.improve(stack, model=start, seed=seed, progress=say, keep=kept, **limits)
+        return improved(stack, say, model=start, seed=seed, keep=kept, **limits)
 
 
 def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,28 +13,13 @@ from rich.text import Text
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise.cli.table import table_of
 from hsnoise.criticism import Comparison, Diagnosis, Story
-from hsnoise.criticism.finding import LEGEND
 from hsnoise.criticism.inspection.inspect import Inspection
+from hsnoise.criticism.sentences import LEGEND
 from hsnoise.fitting.result import TITLES, FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.structure import explained
 
 LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
-OPTIONS = {
-    "exposure_s": "--exposure",
-    "black_level": "--black-level",
-    "white_level": "--white-level",
-    "cfa": "--cfa",
-    "roi": "--roi",
-    "overscan": "--overscan",
-    "shutter": "--shutter",
-    "kind": "--kind",
-    "flats": "--flats",
-    "report": "--report",
-    "model": "--model",
-    "params": "--model",
-    "seed": "--seed",
-}
 WORDS = ("added", "effect", "group of statistics", "worst group")  # headings of columns of text
 COLOURS = {Light.GREEN: "green", Light.AMBER: "yellow", Light.RED: "red"}
 
@@ -55,7 +39,7 @@ class Page:
 
     conclusion: Conclusion
     doubts: tuple[str, ...] = ()
-    tables: tuple[Table | str, ...] = ()
+    tables: tuple[Table | tuple[str, ...], ...] = ()
     notes: tuple[str, ...] = ()
     rest: tuple[str, ...] = ()
     colour: str = "yellow"
@@ -64,10 +48,10 @@ class Page:
 def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     """Print a page: what fits on one screen, how many lines were left out, and the `foot` in full; or all."""
     console = screen()
-    doubts = [Text(f"! {in_options(one)}", page.colour) for one in page.doubts]
+    doubts = [Text(f"! {one}", page.colour) for one in page.doubts]
     head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
     tables = [one for table in page.tables for one in _rows(table, console)]
-    notes, rest = ([_printed(Text(in_options(one)), console) for one in part] for part in (page.notes, page.rest))
+    notes, rest = ([_printed(Text(one), console) for one in part] for part in (page.notes, page.rest))
     last = [_printed(Text(one), console) for one in foot]
     everything = [*head, *tables, *notes, *rest]
     room = LINES - _count(last) - 1
@@ -77,14 +61,6 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     more = [f"{left_out} more line{'s' if left_out > 1 else ''}: --verbose"] if left_out else []
     # In one piece: a reader that is gone is no reason to break off in the middle.
     print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), flush=True)
-
-
-def in_options(text: str) -> str:
-    """A message of the library for users of the command line, who know its options, not arguments."""
-    argument, colon, rest = text.partition(":")
-    text = f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
-    with_value = re.compile(r"\b(\w+)=(?=(['\"\d])|\W|$)")
-    return with_value.sub(lambda m: f"{OPTIONS[m[1]]}{' ' if m[2] else ''}" if m[1] in OPTIONS else m[0], text)
 
 
 def screen() -> Console:
@@ -140,13 +116,12 @@ def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
 
 def page_of_inspection(found: Inspection) -> Page:
     parts = found.parts
-    notes = [line for name in ("determined", "next") for line in parts[name].splitlines()]
     return Page(
         conclusion=found.conclusion,
         doubts=found.findings,
-        tables=(f"\n{parts['capture']}\n", f"{parts['groups']}\n"),
-        notes=(*notes, *parts["assumed"].splitlines()),
-        rest=tuple(parts["budget"].splitlines()),
+        tables=(("", *parts["capture"], ""), (*parts["groups"], "")),
+        notes=(*parts["determined"], *parts["next"], *parts["assumed"]),
+        rest=parts["budget"],
     )
 
 
@@ -180,10 +155,10 @@ def _printed(text: Text, console: Console) -> Printed:
     return text.plain, len(lines)
 
 
-def _rows(table: Table | str, console: Console) -> list[Printed]:
+def _rows(table: Table | tuple[str, ...], console: Console) -> list[Printed]:
     if isinstance(table, Table):
         return [(line, 1) for line in _lines(table, console)]
-    return [(line, -(-len(line) // console.width) or 1) for line in table.split("\n")]
+    return [(line, -(-len(line) // console.width) or 1) for line in table]
 
 
 def _lines(one: Table | Text, console: Console) -> list[str]:

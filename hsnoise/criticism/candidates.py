@@ -7,13 +7,16 @@ to draw, so that an effect is recognised whatever they are.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import numpy as np
 
+from hsnoise._core.arguments import listed
 from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
+from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import black_level_of, draw_capture, light_of
+from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.structure import code_step, moving_line, places
@@ -95,3 +98,52 @@ def given(effect: AbstractEffect) -> Maker:
 def made(maker: Maker, amplitude: float, detail: int) -> AbstractEffect:
     """The effect at an amplitude, with details number `detail`."""
     return maker(amplitude, np.random.default_rng(detail))
+
+
+def check_candidates(candidates: Any) -> tuple[Suspect, ...]:
+    """The candidates of a user. Raises TypeError unless they are effects, ValueError for two of one name."""
+    if isinstance(candidates, AbstractEffect) or _is_effect_class(candidates):
+        raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
+    candidates = listed("candidates", candidates, "a list of effects")
+    for effect in candidates:
+        if _is_effect_class(effect) and not can_be_proposed(effect):
+            raise TypeError(
+                f"candidates: expected effects that are instances, or classes with a propose; {effect.__name__} is a"
+                " class without one"
+            )
+        if not isinstance(effect, AbstractEffect) and not _is_effect_class(effect):
+            raise TypeError(f"candidates: expected effects (of AbstractEffect), got {effect!r}")
+    names = [effect.name for effect in candidates]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"candidates: {', '.join(sorted(twice))} given more than once")
+    return candidates
+
+
+def _is_effect_class(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, AbstractEffect)
+
+
+def check_makers(
+    candidates: tuple[Suspect, ...], model: NoiseModel, like: FrameStack, facts: CaptureFacts
+) -> dict[str, Maker]:
+    """Makers of a user's candidates, by name, less what the capture cannot show.
+
+    Raises TypeError for a `propose` that gives no such effect, ValueError for draws that are no signal of a sensor.
+    """
+    makers = proposed(candidates, facts)
+    for one in candidates:
+        if one.name in makers:
+            effect = made(makers[one.name], 1.0, 0)
+            if getattr(effect, "name", None) != one.name:
+                raise TypeError(f"candidates: expected {one.name}.propose to make {one.name} effects, got {effect!r}")
+            check_effects(model.add(effect), like)
+    return makers
+
+
+def not_in(model: NoiseModel, candidates: tuple[Suspect, ...]) -> tuple[Suspect, ...]:
+    """The candidates. Raises ValueError for one that the model has."""
+    for effect in candidates:
+        if effect.name in model:
+            raise ValueError(f"candidates: {effect.name} is in the model already")
+    return candidates

@@ -10,7 +10,7 @@ from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.ranking import Candidate, Evidence
 from hsnoise.effects import BlackClamp
 from hsnoise.fit import fit, without_likelihood
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
 from hsnoise.simulation.gaussian import Gaussian
 from hsnoise.simulation.simulator import Simulator
 
@@ -21,12 +21,14 @@ DRAWS = 40
 def clamp_by_likelihood(
     fitted: FitResult, bench: Bench, evidence: Evidence
 ) -> tuple[Candidate, Evidence, Gaussian] | None:
-    """The capture refitted with a clamp: candidate, evidence and distribution with it; None if no better, or not to be done.
+    """The capture refitted with a clamp: candidate, evidence and distribution with it.
+
+    None if it is no better, or cannot be done.
 
     It can be done for a maximum-likelihood fit of darks at several exposures, without other effects in the model.
     """
     model = bench.model
-    if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
+    if not isinstance(fitted, FitResult) or fitted.method != Method.ML or CLAMP in model:
         return None
     if without_likelihood(model) or np.ptp(fitted.summary.exposure_s) == 0:
         return None

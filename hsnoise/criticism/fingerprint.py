@@ -88,6 +88,8 @@ class Bench:
             for name, (_, amplitudes) in wanted.items()
             for amplitude in amplitudes
         ]
+        if not tasks:
+            return []
         models = [(self.model.add(made(wanted[name][0], *rest)), rest[1]) for name, *rest in tasks]
         shifts = dict(zip(tasks, self.shifts(models), strict=True))
         return [

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
+from hsnoise.criticism import sentences
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.portion import Portion
@@ -26,16 +27,12 @@ def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, Fram
     return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
 
 
-def told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
+def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     """Which frames were fitted and which held out, in words."""
     if held_out is None:
         return ""
     kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
-    return (
-        f"Fitted and compared were the first {_span(kept)} dark frames of each exposure; held-out: the log-likelihood"
-        f" of the statistics of the other {_span(held_out.n_frames)}, in nats (one more: 2.7 times as probable). To fit"
-        " all of them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
-    )
+    return sentences.split(kept, held_out.n_frames)
 
 
 def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callable[[], None] = lambda: None) -> float:
@@ -44,7 +41,3 @@ def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callabl
     own = simulator.reference(model, DRAWS)
     z = own.z(simulator.measured.values)
     return float(own.distribution.log_density(z) - np.log(own.deviation).sum())
-
-
-def _span(numbers: Sequence[int]) -> str:
-    return f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from hsnoise._core.threads import in_threads
+from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint, distribution_of
 from hsnoise.effects import AbstractEffect
@@ -18,8 +19,6 @@ GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
 CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
 PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
 LEAST_P = 1e-9
-EVIDENCE = 8.0  # least log-likelihood ratio from which an effect is there: Markov's inequality, of 27 candidates
-FALSE_ALARMS, TAIL = 0.001, 0.1  # probability of one; share of the draws that tell how the scores of chance fall off
 LEADERS = 3  # candidates that are paired with all others
 
 
@@ -48,18 +47,25 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the candidates are judged by: z [statistic] of the capture, its distribution if nothing is missing, names, groups."""
+    """What candidates are judged by: z of the capture [statistic], its distribution if nothing is missing, groups."""
 
     z: np.ndarray
     null: Gaussian
     names: tuple[str, ...]
     groups: tuple[str, ...]
     candidates: int
-    limit: float = EVIDENCE  # log-likelihood ratio from which an effect is there
+    chance: float = 0.0  # score that draws of the model exceed in CHANCE_RATE of the cases; 0 if none were scored
+    has_flats: bool = False  # whether the capture has flats
 
     @property
-    def has_flats(self) -> bool:
-        return any(group.startswith("flats") for group in self.groups)
+    def least(self) -> float:
+        """Log-likelihood ratio, nats, from which one of the candidates may be there."""
+        return rules.evidence(self.candidates)
+
+    @property
+    def limit(self) -> float:
+        """Log-likelihood ratio, nats, from which one of them is there, what chance gives in such a capture included."""
+        return max(self.least, self.chance)
 
     @cached_property
     def nothing(self) -> float:
@@ -125,7 +131,7 @@ def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) ->
     return Judged(of, float(amplitudes[i]), score, evidence.misfit(tried[i]))
 
 
-def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray) -> float:
+def limit_by_chance(prints: Iterable[Fingerprint], evidence: Evidence, z: np.ndarray) -> float:
     """Score that hardly any capture with nothing missing exceeds, from the z [draw, statistic] of such draws, nats.
 
     With distributions estimated from few draws, scores exceed Markov's bound. The best scores of the draws fall off
@@ -133,31 +139,30 @@ def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray
     """
 
     def best_of(of: Fingerprint) -> np.ndarray:
-        return np.max([of.distribution(float(amplitude), null).log_density(z) for amplitude in GRID[::2]], 0)
+        return np.max([of.distribution(float(amplitude), evidence.null).log_density(z) for amplitude in GRID[::2]], 0)
 
-    best = np.max(in_threads(best_of, prints), 0) - null.log_density(z)
-    start = float(np.quantile(best, 1 - TAIL))
+    best = np.max(in_threads(best_of, prints), 0) - evidence.null.log_density(z)
+    start = float(np.quantile(best, 1 - rules.CHANCE_TAIL))
     beyond = float(np.mean(best[best > start] - start)) if (best > start).any() else 0.0
-    return max(EVIDENCE, start + beyond * float(np.log(TAIL / FALSE_ALARMS)))
+    return start + beyond * float(np.log(rules.CHANCE_TAIL / rules.CHANCE_RATE))
 
 
 def best_pairs(judged: list[Judged], evidence: Evidence, number: int) -> list[Pair]:
     """The pairs that describe the capture best, of the leading candidates with all others; `judged` is best first."""
     alone = {
-        first.of.name: {
-            float(a): first.of.distribution(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude
-        }
+        first.of.name: {float(a): first.of.distribution(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude}
         for first in judged[:LEADERS]
     }
 
     def best_of(both: tuple[Judged, Judged]):
         together = _together(alone[both[0].of.name], both[1], evidence.null)
         scored = [(evidence.score(distribution), amplitudes, distribution) for amplitudes, distribution in together]
-        return (*max(scored, key=lambda one: one[0]), both)
+        score, amplitudes, distribution = max(scored, key=lambda one: one[0])
+        return score, amplitudes, distribution, both
 
     pairs = [(first, second) for i, first in enumerate(judged[:LEADERS]) for second in judged[i + 1 :]]
     best = sorted(in_threads(best_of, pairs), key=lambda one: -one[0])[:number]
-    return [_pair(*one, evidence) for one in best]
+    return [_pair(score, amplitudes, distribution, both, evidence) for score, amplitudes, distribution, both in best]
 
 
 def _pair(score: float, amplitudes, distribution: Gaussian, both, evidence: Evidence) -> Pair:

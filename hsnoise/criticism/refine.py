@@ -84,9 +84,7 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
         off = evidence.z - nearby.mean
         share = share_of_far(off / np.sqrt(np.diagonal(nearby.covariance)))
         weighted = slopes.T @ (share[:, None] * np.linalg.inv(nearby.covariance) * share)
-        taken = _limited(
-            np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * (y - start))
-        )
+        taken = _limited(np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * (y - start)))
         y = y + taken
         if np.abs(taken).max() < SHORT_STEP:
             break

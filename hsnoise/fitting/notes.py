@@ -7,6 +7,7 @@ from itertools import chain
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.fitting.flat_notes import flat_notes
 from hsnoise.fitting.profile import WEAK
 from hsnoise.fitting.result import FitResult
@@ -230,13 +231,13 @@ def _light_note(result: FitResult) -> list[str]:
     if _is_lit(result, levels):
         return [
             f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
-            f" {exposures.max():g} s: if they saw light, they are flats; pass kind='flat'."
+            f" {exposures.max():g} s: if they saw light, they are flats; pass {setting('kind', 'flat')}."
         ]
     if not rate >= LIGHT_E_PER_S:
         return []
     return [
         f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
-        " pass kind='flat'."
+        f" pass {setting('kind', 'flat')}."
     ]
 
 

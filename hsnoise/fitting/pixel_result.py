@@ -22,7 +22,7 @@ from hsnoise.effects import (
     RowNoise,
 )
 from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import Summary
@@ -81,8 +81,9 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         params=params,
         names=names,
         covariance=covariance,
-        method="transfer",
-        outcome=_outcome(pixel),
+        method=Method.TRANSFER,
+        status=Status.TRANSFER,
+        detail=_detail(pixel),
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),
@@ -99,7 +100,7 @@ def in_electrons(number: Number) -> bool:
     return number.place in IN_ELECTRONS or number.effect in set(POPULATION) - IN_OTHER_UNITS
 
 
-def _outcome(pixel: PixelFit) -> str:
+def _detail(pixel: PixelFit) -> str:
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
     if pixel.flats is not None and pixel.determined:
         return "gain from the flats, read noise from each pixel over time"

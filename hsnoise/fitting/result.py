@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
@@ -25,15 +26,49 @@ from hsnoise.likelihood.summary import Summary, without_counts
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
 
-TITLES = {
-    "ml": "Joint maximum likelihood",
-    "line": "Line fit",
-    "transfer": "Pixel transfer",
-    "synthetic": "Base fit, corrected for added effects by simulated statistics",
-}
 
-NOT_CONVERGED = "NOT CONVERGED: "
-AGREES = "Nothing in these frames contradicts these numbers. Compare tells whether frames drawn from them look alike."
+class Method(StrEnum):
+    """What a result was fitted by."""
+
+    ML = "ml"
+    LINE = "line"
+    TRANSFER = "transfer"
+    SYNTHETIC = "synthetic"
+
+
+class Status(StrEnum):
+    """How a fit ended."""
+
+    CONVERGED = "converged"
+    NOT_CONVERGED = "not converged"
+    LINE = "line fit"  # as asked
+    LINE_INSTEAD = "line fit instead"  # of a likelihood that did not converge
+    TRANSFER = "pixel transfer"
+    TRANSFER_INSTEAD = "pixel transfer instead"  # of a likelihood that did not converge
+    CONTRADICTED = "likelihood contradicted"  # by pixels over time: pixel transfer instead
+    MET = "statistics met"  # by simulated ones
+    NOT_MET = "statistics not met"
+
+
+TITLES = {
+    Method.ML: "Joint maximum likelihood",
+    Method.LINE: "Line fit",
+    Method.TRANSFER: "Pixel transfer",
+    Method.SYNTHETIC: "Base fit, corrected for added effects by simulated statistics",
+}
+OUTCOMES = {
+    Status.CONVERGED: "converged: {}",
+    Status.NOT_CONVERGED: "NOT CONVERGED: {}",
+    Status.LINE: "the paper's line fit, as asked",
+    Status.LINE_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); the line fit instead",
+    Status.TRANSFER: "{}",
+    Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer instead",
+    Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer instead",
+    Status.MET: "simulated statistics met: {}",
+    Status.NOT_MET: "NOT CONVERGED: simulated statistics not met: {}",
+}
+AGREES = "Nothing in these frames contradicts these numbers."
+LOOK_ALIKE = "Compare tells whether frames drawn from them look alike."
 
 
 @dataclass(frozen=True)
@@ -44,7 +79,8 @@ class FitResult:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         names, covariance: fitted parameters and their covariance, in the units of `table`.
         method: "ml", "line", "transfer" where pixels differ, or "synthetic" with effects beyond the paper's.
-        outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
+        status: how the fit ended; detail: the numbers to it, in words (`outcome` is both in a sentence).
+        iterations: quasi-Newton steps taken.
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
         summary: the row histograms and photon transfer that were fitted.
@@ -61,8 +97,9 @@ class FitResult:
     params: NoiseModel
     names: tuple[str, ...]
     covariance: np.ndarray
-    method: str
-    outcome: str
+    method: Method
+    status: Status
+    detail: str
     iterations: int
     log_likelihood: float
     notes: tuple[str, ...]
@@ -86,15 +123,15 @@ class FitResult:
         if not self.converged:
             return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
         if not self.doubts:
-            return Conclusion(Light.GREEN, AGREES)
+            return Conclusion(Light.GREEN, AGREES, LOOK_ALIKE)
         first = self.doubts[0]
         others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
         # That there is no gain is no error: noise in DN can be used.
         if not self.has_gain and not others:
-            return Conclusion(Light.AMBER, f"In DN only. {first}")
+            return Conclusion(Light.AMBER, "In DN only.", first)
         if self.grave:
-            return Conclusion(Light.RED, f"Do not use these numbers. {first}{others}")
-        return Conclusion(Light.AMBER, f"Usable, with doubts. {first}{others}")
+            return Conclusion(Light.RED, "Do not use these numbers.", f"{first}{others}")
+        return Conclusion(Light.AMBER, "Usable, with doubts.", f"{first}{others}")
 
     @property
     def has_gain(self) -> bool:
@@ -125,10 +162,20 @@ class FitResult:
             rows_[name] = (value, error, unit)
         return rows_
 
+    def rows_of(self, effect: str) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table` that are one effect's. Raises KeyError if the model has none of that name."""
+        table = self.table
+        return {one.name: table[one.name] for one in self.params[effect].parameters(self.params.channels)}
+
+    @property
+    def outcome(self) -> str:
+        """How the fit ended, in words."""
+        return OUTCOMES[self.status].format(self.detail)
+
     @property
     def converged(self) -> bool:
         """Whether the fit ended where it should."""
-        return not self.outcome.startswith(NOT_CONVERGED)
+        return self.status not in (Status.NOT_CONVERGED, Status.NOT_MET)
 
     def without(self, names: tuple[str, ...]) -> FitResult:
         """The same fit without some of the effects that it put in by itself; other numbers stay as they are."""

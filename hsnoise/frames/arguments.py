@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.arguments import listed, not_negative, numbers, one_of, positive
+from hsnoise._core.naming import named, setting
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.lazy import LazyFrames
 
@@ -96,7 +97,7 @@ def check_sizes(groups: tuple[Any, ...], cfa: str) -> None:
     if cfa != "mono" and (rows % 2 or columns % 2):
         raise ValueError(
             f"counts: a Bayer sensor ({cfa}) needs even numbers of rows and columns, got {rows} x {columns}; "
-            "crop the frames (hsnoise.load: roi=)"
+            f"crop the frames (hsnoise.load: {setting('roi')})"
         )
 
 
@@ -114,10 +115,10 @@ def kinds(kind: str | Sequence[str], n: int) -> tuple[str, ...]:
     """Kind of each exposure."""
     given = (kind,) * n if isinstance(kind, str) else listed("kind", kind, "'dark', 'flat' or a list of them")
     if len(given) != n:
-        raise ValueError(f"kind: expected one, or {n} (one an exposure), got {len(given)}: {given}")
+        raise ValueError(f"{named('kind')}: expected one, or {n} (one an exposure), got {len(given)}: {given}")
     for one in given:
         if one == "bias":
-            raise ValueError("kind: got 'bias', expected 'dark' or 'flat'; a bias frame is a dark of 0 s")
+            raise ValueError(f"{named('kind')}: got 'bias', expected 'dark' or 'flat'; a bias frame is a dark of 0 s")
         one_of("kind", one, KINDS)
     return given
 

@@ -6,18 +6,24 @@ import warnings
 
 import numpy as np
 
+from hsnoise._core.naming import named, setting
+
 MOSAIC_SIGMA, LEAST_PIXELS, MOST_PIXELS = 6.0, 1024, 1 << 20
 MOSAIC_MEAN, MOSAIC_VARIANCE = 0.15, 0.04  # of a pixel's noise and variance: taps of a mono CCD leave 0.09, 0.01
-MOSAIC = (
-    "read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it is one, give"
-    " its Bayer order: cfa='RGGB', say"
-)
+
+
+def mosaic_in_words() -> str:
+    """What is odd about frames that look like a mosaic, and what to do."""
+    return (
+        "read as mono, but the four pixels of each 2 x 2 block differ, as those of a colour sensor do; if it is one,"
+        f" give its Bayer order: {setting('cfa', 'RGGB')}, say"
+    )
 
 
 def warn_of_a_mosaic(frame: np.ndarray) -> None:
     """Warn if a frame [row, column], said to be mono, looks like a colour mosaic."""
     if looks_like_a_mosaic(frame):
-        warnings.warn(f"cfa: {MOSAIC}", stacklevel=4)
+        warnings.warn(f"{named('cfa')}: {mosaic_in_words()}", stacklevel=4)
 
 
 def looks_like_a_mosaic(frame: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise.plots._budget import ORDER, SHADES
+from hsnoise.statistics.structure import OF_FLATS
 
 OTHER = "other"
 COLOUR_OF = {**SHADES, OTHER: "#8C8C8C"}
@@ -36,6 +37,7 @@ FAMILIES = {
     "static columns": "column",
     "static rows": "row",
 }
+FAMILIES |= {of_flats: FAMILIES[group] for group, of_flats in OF_FLATS.items()}
 PLACE = {name: i for i, name in enumerate((*ORDER, OTHER))}
 
 
@@ -50,7 +52,7 @@ class Part(NamedTuple):
 
 def family_of(group: str) -> str:
     """The component of the noise budget that a group of statistics is about, or "other"."""
-    return FAMILIES.get(group.removeprefix("flats, "), OTHER)
+    return FAMILIES.get(group, OTHER)
 
 
 def parts_of(comparison) -> list[Part]:

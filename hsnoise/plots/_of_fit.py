@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
+from hsnoise.fitting.result import Method
 from hsnoise.plots._histograms import histograms
 from hsnoise.plots._photon_transfer import has_photon_transfer, photon_transfer
 from hsnoise.plots._pixel_map import pixel_map
@@ -20,7 +21,7 @@ def of_fit(fit) -> dict[str, Figure]:
     Args:
         fit: result of `hsnoise.fit`.
     """
-    if fit.method == "synthetic":
+    if fit.method == Method.SYNTHETIC:
         return {}
     conditional = fit.transfer is not None
     drawings = {

@@ -11,7 +11,8 @@ from hsnoise._core.types import cfa_tile, seconds
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.darks import black_level
 from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
-from hsnoise.simulation.draws import draw_capture, middle_of
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import middle_of
 from hsnoise.statistics.pixels.classes import growth_noise, levels_of, slope_over
 from hsnoise.statistics.pixels.survey import survey
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
@@ -13,8 +12,8 @@ import numpy as np
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
-from hsnoise.criticism.compare import FITS, nearer
-from hsnoise.criticism.improve import UNFINISHED
+from hsnoise.criticism.compare import nearer
+from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.criticism.story import together
 from hsnoise.fitting.result import FitResult, number, rounded
 from hsnoise.frames.stack import FrameStack
@@ -57,7 +56,7 @@ def context(
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
         "conclusion": said,
         "light": LIGHTS[said.light],
-        "said": _apart(said.sentence),
+        "said": (said.head, said.rest),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
         "doubts": fit.doubts if isinstance(fit, FitResult) else (),
@@ -70,7 +69,7 @@ def context(
         "ranking": [] if diagnosis is None else ranking(diagnosis),
         "story": None if story is None else steps(story),
         "stacked": None if story is None else stacked(story),
-        "unfinished": story is not None and story.ended.startswith(UNFINISHED.partition(":")[0]),
+        "unfinished": story is not None and story.ending.why == Ended.UNFINISHED,
         "ended": "" if story is None else story.ended,
         "split": "" if story is None else story.split,
     }
@@ -82,20 +81,12 @@ def conclusion(found: Comparison | Diagnosis | Story | FitResult, comparison: Co
     if not isinstance(found, Diagnosis) or comparison is None:
         return said
     error = f"error {number(comparison.error)}"
-    if found.verdict == "nothing missing" and comparison.error >= FITS:
+    if found.verdict != Verdict.NOTHING_MISSING:
+        return Conclusion(said.light, said.head, f"{error.capitalize()}, {YARDSTICK}.")
+    if not comparison.fits:
         text = f"No effect stands out, but the model does not fit these frames ({error}): is it a fit of this capture?"
         return Conclusion(Light.RED, text)
-    after = f" ({error})" if found.verdict == "nothing missing" else f"; {error}, {YARDSTICK}"
-    return Conclusion(said.light, f"{said.sentence.removesuffix('.')}{after}.")
-
-
-def _apart(sentence: str) -> tuple[str, str]:
-    """A conclusion as what is read first, up to its first full stop or semicolon, and the rest."""
-    found = re.match(r"(.+?[.;]) (.+)", sentence)
-    if found is None:
-        return sentence, ""
-    first, rest = found.groups()
-    return first.replace(";", "."), rest[0].upper() + rest[1:]
+    return Conclusion(said.light, f"Nothing significant is missing ({error}).")
 
 
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from hsnoise.criticism.budget import NoiseBudget, budget
 from hsnoise.frames.bayer import channel_pixels, channel_planes
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_fits, darks_of, draw_capture, middle_of
+from hsnoise.simulation.draws import check_fits, draw_capture
+from hsnoise.simulation.portion import Portion, middle_of
 
 DRAWS = 4
 SEED_APART = 9000  # the draws shown are none of those that the comparison was made with
@@ -80,7 +81,7 @@ def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shorte
 
 @lru_cache(maxsize=1)  # a page is written after each step of a story, and files are slow to read
 def _darks(stack: FrameStack) -> FrameStack:
-    return darks_of(stack).select(frames=slice(0, MOST_FRAMES))
+    return Portion.of(stack).darks.frames.select(frames=slice(0, MOST_FRAMES))
 
 
 @lru_cache(maxsize=2)

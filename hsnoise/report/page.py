@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from hsnoise._core.naming import named
 from hsnoise._core.output import write_atomically
 from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.fitting.result import FitResult
@@ -29,11 +30,11 @@ def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
-        raise ValueError(f"report: expected a file ending in .html, got {path}")
+        raise ValueError(f"{named('report')}: expected a file ending in .html, got {path}")
     if path.is_dir():
-        raise ValueError(f"report: expected a file, but {path} is a folder")
+        raise ValueError(f"{named('report')}: expected a file, but {path} is a folder")
     if not path.parent.is_dir() and (made is None or path.parent.resolve() != Path(made).resolve()):
-        raise ValueError(f"report: there is no folder {path.parent}")
+        raise ValueError(f"{named('report')}: there is no folder {path.parent}")
 
 
 def page(

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.keys import key_of, named_key
+from hsnoise._core.naming import named, setting
 from hsnoise._core.types import RandomKey, cfa_tile
 from hsnoise.effects import Stage
 from hsnoise.frames.stack import FrameStack
@@ -21,14 +22,14 @@ SURFACE_DEGREE = 3  # of the light on flats
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
     """Raise TypeError or ValueError, naming the argument, unless `model` can describe the sensor of `stack`."""
     if not isinstance(model, NoiseModel):
-        raise TypeError(f"{name}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
+        raise TypeError(f"{named(name)}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
     if (model.cfa, model.shutter) != (stack.cfa, stack.shutter):
         raise ValueError(
-            f"{name}: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
-            " files do not say so, give it cfa= and shutter=)"
+            f"{named(name)}: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter}"
+            f" (if its files do not say so, give it {setting('cfa')} and {setting('shutter')})"
         )
     if "adc" not in model:
-        raise ValueError(f"{name}: expected a model with the effect adc, which makes counts (DN)")
+        raise ValueError(f"{named(name)}: expected a model with the effect adc, which makes counts (DN)")
 
 
 def check_effects(model: NoiseModel, like: FrameStack) -> None:

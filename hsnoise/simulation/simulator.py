@@ -72,9 +72,9 @@ class Simulator:
         """Statistics of draws, by model and number [draw, statistic]; those not drawn yet are drawn in threads."""
         return np.stack([one.values for one in self._all(wanted)])
 
-    def reference(self, model: NoiseModel, count: int) -> Reference:
+    def reference(self, model: NoiseModel, count: int, first: int = 0) -> Reference:
         """How the statistics of draws of a model scatter."""
-        found = self._all([(model, number) for number in range(count)])
+        found = self._all([(model, first + number) for number in range(count)])
         values = np.stack([one.values for one in found])
         return Reference.of(found[0].names, found[0].groups, values, np.median([one.error for one in found], axis=0))
 

@@ -81,7 +81,7 @@ def lags(sheet: Sheet, x: Exposure) -> None:
     error = 1 / np.sqrt(planes * rows * columns)
     for lag in STATIC_LAGS:
         value = fisher(_lag_product(static, lag) / power + _sum_to_zero(x, lag))
-        sheet.add("static pixels", f"map, {lag[0]} rows {lag[1]} columns away", value, error)
+        sheet.add("static pixels", f"map, {lag[0]} rows {lag[1]} columns away", value, error, of_map=True)
 
 
 def _sum_to_zero(x: Exposure, lag: tuple[int, int]) -> float:
@@ -129,18 +129,18 @@ def tails(sheet: Sheet, x: Exposure) -> None:
     if x.shape[1] > 1:
         spread = np.abs(x.pixel).mean((1, 2), keepdims=True) * np.float32(np.sqrt(np.pi / 2)) + np.float32(1e-6)
         static = x.pixel / spread
-        _count_tails(sheet, "static pixels", "pixels of the map", static)
+        _count_tails(sheet, "static pixels", "pixels of the map", static, of_map=True)
         bounded = np.clip(static, -BOUND, BOUND)
         square = bounded * bounded
         kurtosis = (square * square).mean((1, 2)) / np.maximum(square.mean((1, 2)) ** 2, 1e-6)
         error = np.sqrt(24 / x.pixel.size) / 3
-        sheet.add("static pixels", "log kurtosis of the map", np.log((kurtosis + 0.01) / 3), error)
+        sheet.add("static pixels", "log kurtosis of the map", np.log((kurtosis + 0.01) / 3), error, of_map=True)
 
 
-def _count_tails(sheet: Sheet, group: str, what: str, values: np.ndarray) -> None:
+def _count_tails(sheet: Sheet, group: str, what: str, values: np.ndarray, *, of_map: bool = False) -> None:
     for limit in TAILS:
         number = np.count_nonzero(values > limit) if limit > 0 else np.count_nonzero(values < limit)
-        sheet.add_count(group, f"{what} {'above' if limit > 0 else 'below'} {limit:g} sigma", number)
+        sheet.add_count(group, f"{what} {'above' if limit > 0 else 'below'} {limit:g} sigma", number, of_map=of_map)
 
 
 def log_temporal_variance(residual: np.ndarray) -> np.ndarray:

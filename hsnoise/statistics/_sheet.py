@@ -32,11 +32,15 @@ def correlation(a: np.ndarray, b: np.ndarray, axes: tuple[int, ...]) -> np.ndarr
 
 @dataclass(frozen=True)
 class Entry:
-    """A statistic of one exposure: a value with its standard error, or a number of rare pixels."""
+    """A statistic of one exposure: a value with its standard error, or a number of rare pixels.
+
+    of_map: whether it describes the static map itself, which in flats shows the shape of the light.
+    """
 
     value: float
     error: float
     is_count: bool = False
+    of_map: bool = False
 
 
 @dataclass
@@ -46,13 +50,13 @@ class Sheet:
     letters: tuple[str, ...]
     entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
 
-    def add(self, group: str, what: str, values: np.ndarray | float, error: float) -> None:
+    def add(self, group: str, what: str, values: np.ndarray | float, error: float, *, of_map: bool = False) -> None:
         """The mean of `values` over whatever axes they have; `error` is that of the mean."""
         values = np.asarray(values, np.float64)
-        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error))
+        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error), of_map=of_map)
 
-    def add_count(self, group: str, what: str, number: float) -> None:
-        self.entries[group, what] = Entry(float(number), 0.5, is_count=True)
+    def add_count(self, group: str, what: str, number: float, *, of_map: bool = False) -> None:
+        self.entries[group, what] = Entry(float(number), 0.5, is_count=True, of_map=of_map)
 
     def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
         """One statistic a colour from values [plane]; `error` is that of one plane."""
@@ -73,8 +77,8 @@ def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
         found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
         total = sum(entry.value for entry in found)
         if found[0].is_count:
-            entry = Entry(math.sqrt(total), 0.5)
+            value, error = math.sqrt(total), 0.5
         else:
-            entry = Entry(total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found))
-        out[group, f"{what}, {half}"] = entry
+            value, error = total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found)
+        out[group, f"{what}, {half}"] = Entry(value, error, of_map=found[0].of_map)
     return out

@@ -50,14 +50,25 @@ WORDS = {
     "strongest frequency": "strongest frequency: how much of the static rows (columns) is one sine",
     "steps of ": "steps of n: how much the mean of n lines changes to the next n",
     "parity": "parity: even against odd lines",
-    "kurtosis": "log kurtosis: weight of the tails, 0 for a normal law",
+    "kurtosis": "log kurtosis: weight of the tails, 0 for a normal distribution",
     "energy of ": "energy of blocks: scatter of the means of blocks of pixels",
     "roughness": "roughness: how much a histogram jumps from code to code",
 }
 
-# What flats tell whatever the light: neither its level, its flicker nor its shape, to which dust belongs.
-SHAPE_OF_LIGHT = ("map, ", "pixels of the map", "log kurtosis of the map")
-FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
+# What flats tell whatever the light, and what it is called there: neither the light's level, its flicker nor its shape,
+# to which dust belongs.
+OF_FLATS = {
+    group: f"flats, {group}"
+    for group in (
+        "noise",
+        "static pixels",
+        "pixels over time",
+        "spatial lags",
+        "tails",
+        "row x frame",
+        "column x frame",
+    )
+}
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
@@ -79,9 +90,9 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     if "flat" in stack.kind:
         lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
         entries |= {
-            (f"flats, {group}", what): e
-            for (group, what), e in lit.items()
-            if group in FLAT_GROUPS and not what.startswith(SHAPE_OF_LIGHT)
+            (OF_FLATS[group], what): entry
+            for (group, what), entry in lit.items()
+            if group in OF_FLATS and not entry.of_map
         }
     return _ordered(entries, layout)
 

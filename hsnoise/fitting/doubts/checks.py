@@ -20,7 +20,7 @@ from hsnoise.fitting.flat_notes import gain_notes
 from hsnoise.fitting.notes import order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import in_electrons
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
 from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
@@ -56,7 +56,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
     notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
@@ -240,7 +240,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
     """Static structure that a fit by pooled histograms takes for noise."""
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         return
     worst = 0.0
     for c in range(len(found.channels)):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.io._kinds import folder_of, frames, names_of
 from hsnoise.frames.io._recording import Recording
 
@@ -49,7 +50,9 @@ def sort_out(read: Sequence[Recording], root: Path) -> Sorted:
         told += _sentences(kept, reasons, root)
         kept = [recording for i, recording in enumerate(kept) if i not in reasons]
         if not kept:
-            raise ValueError(f"path: no dark and no flat frames: {'; '.join(told)}; give kind= if they are")
+            raise ValueError(
+                f"{named('path')}: no dark and no flat frames: {'; '.join(told)}; give {setting('kind')} if they are"
+            )
     size = _main_size(kept)
     return Sorted([r for r in kept if r.size == size], [r for r in kept if r.size != size], told)
 
@@ -129,7 +132,7 @@ def _of_other(name: str, words: str, read: list[Recording]) -> Reasons:
     tied = _tied(known, lambda r: getattr(r, name))
     if len(tied) > 1:
         one, two = (next(r for r in known if getattr(r, name) == value) for value in tied[:2])
-        hint = "load them separately" if name != "cfa" else "give cfa= or load them separately"
+        hint = "load them separately" if name != "cfa" else f"give {setting('cfa')} or load them separately"
         raise ValueError(f"{one.path} and {two.path} differ in {name}: {tied[0]} and {tied[1]}; {hint}")
     return {
         i: (f" of {words.format(getattr(r, name))}", f"the others have {words.format(tied[0])}")

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsnoise._core.arguments import numbers, span
+from hsnoise._core.naming import named, setting
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.bayer import shift_cfa
 from hsnoise.frames.io import _emva
@@ -106,7 +107,9 @@ def _check_exposures(read: list[Recording], source: str) -> None:
     for recording in read:
         value = recording.exposure_s
         if value is None:
-            raise ValueError(f"{recording.path}: no exposure time (looked for {source}); give exposure_s=, in seconds")
+            raise ValueError(
+                f"{recording.path}: no exposure time (looked for {source}); give {setting('exposure_s')}, in seconds"
+            )
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{recording.path}: expected an exposure_s >= 0, got {value} s")
 
@@ -116,7 +119,8 @@ def _warn_of_other_exposures(read: list[Recording], given: list[float]) -> None:
         own = recording.exposure_s
         if own is not None and abs(value - own) > RELATIVE_TOLERANCE * own:
             warnings.warn(
-                f"exposure_s: {recording.path} says {own:g} s; the given {value:g} s are taken instead", stacklevel=4
+                f"{named('exposure_s')}: {recording.path} says {own:g} s; the given {value:g} s are taken instead",
+                stacklevel=4,
             )
             return
 
@@ -125,7 +129,8 @@ def _warn_of_another_cfa(read: list[Recording], given: str) -> None:
     for recording in read:
         if recording.cfa not in (None, UNKNOWN_ORDER, given):
             warnings.warn(
-                f"cfa: {recording.path} says {recording.cfa}; the given {given} is taken instead", stacklevel=4
+                f"{named('cfa')}: {recording.path} says {recording.cfa}; the given {given} is taken instead",
+                stacklevel=4,
             )
             return
 
@@ -195,7 +200,7 @@ def _black_dn(read: list[Recording]) -> float:
 def _cfa(read: list[Recording]) -> str:
     found = _known(read, "cfa") or "mono"
     if found == UNKNOWN_ORDER:
-        raise ValueError(f"{read[0].path}: a colour mosaic, but its Bayer order is not certain; give cfa=")
+        raise ValueError(f"{read[0].path}: a colour mosaic, but its Bayer order is not certain; give {setting('cfa')}")
     return found
 
 
@@ -208,7 +213,7 @@ def _black_level(read: list[Recording]) -> Any:
     if np.ptp(levels_dn, axis=0).max() > 1:
         raise ValueError(
             f"files differ in black_level by more than 1 DN ({levels_dn.min():g} to {levels_dn.max():g}); "
-            "give black_level= or load them separately"
+            f"give {setting('black_level')} or load them separately"
         )
     return levels_dn.mean(axis=0)
 
@@ -216,7 +221,7 @@ def _black_level(read: list[Recording]) -> Any:
 def _region(counts: list[Any], cfa: str, roi: tuple[Any, Any], row_axis: int) -> tuple[list[Any], str]:
     """Counts and Bayer order of a region, all in stored orientation; `roi` is in sensor orientation."""
     if not isinstance(roi, Sequence) or len(roi) != 2:
-        raise ValueError(f"roi: expected ((first row, end row), (first column, end column)), got {roi!r}")
+        raise ValueError(f"{named('roi')}: expected ((first row, end row), (first column, end column)), got {roi!r}")
     sizes = counts[0].shape[1:]
     spans = roi[::-1] if row_axis == 1 else roi
     rows, columns = (span("roi", one, size) for one, size in zip(spans, sizes, strict=True))

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from hsnoise._core.naming import named
 from hsnoise.frames.io._kinds import folder_of
 from hsnoise.frames.lazy import in_order
 
@@ -44,7 +45,9 @@ def paths_of(path: Any) -> tuple[list[Path], list[str]]:
     told: list[str] = []
     if not isinstance(path, str | Path):
         if not isinstance(path, Iterable):
-            raise TypeError(f"path: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}")
+            raise TypeError(
+                f"{named('path')}: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}"
+            )
         for one in map(Path, path):
             inside, passed = _below(one) if one.is_dir() else ([one], [])
             paths += inside
@@ -56,10 +59,10 @@ def paths_of(path: Any) -> tuple[list[Path], list[str]]:
     else:
         paths = [Path(path)]
     if not paths:
-        raise FileNotFoundError(f"path: no capture in {path!s}; known formats: {' '.join(READERS.values())}")
+        raise FileNotFoundError(f"{named('path')}: no capture in {path!s}; known formats: {' '.join(READERS.values())}")
     for one in paths:
         if not one.is_file():
-            raise FileNotFoundError(f"path: no such file or folder: {one}")
+            raise FileNotFoundError(f"{named('path')}: no such file or folder: {one}")
     return paths, told
 
 
@@ -102,7 +105,7 @@ def of_one_format(paths: list[Path], root: Path) -> tuple[list[Path], ModuleType
     if others and others[0][1] == n:
         first = [next(path.name for path, name in zip(paths, names, strict=True) if name == one) for one in names]
         one, two = list(dict.fromkeys(first))[:2]
-        raise ValueError(f"path: files of several formats ({one}, {two}); give a pattern such as '*.dng'")
+        raise ValueError(f"{named('path')}: files of several formats ({one}, {two}); give a pattern such as '*.dng'")
     reader = import_module(f"hsnoise.frames.io.{most}")
     chosen = [path for path, name in zip(paths, names, strict=True) if name == most]
     rest = [path for path, name in zip(paths, names, strict=True) if name != most]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.arguments import KINDS
 from hsnoise.frames.io._recording import Recording
 
@@ -51,11 +52,11 @@ def with_kinds(read: Sequence[Recording], given: Any, root: Path) -> tuple[list[
     """
     kinds = [given] * len(read) if given is None or isinstance(given, str) else list(given)
     if len(kinds) != len(read):
-        raise ValueError(f"kind: expected one, or {len(read)} (one a file or exposure), got {given}")
+        raise ValueError(f"{named('kind')}: expected one, or {len(read)} (one a file or exposure), got {given}")
     out, reasons = [], []
     for recording, kind in zip(read, kinds, strict=True):
         if kind is not None and kind not in KINDS:
-            raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {kind!r}; give kind=")
+            raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {kind!r}; give {setting('kind')}")
         found, reason = (kind, None) if kind is not None else _told(recording, root)
         exposure_s = 0.0 if found == "bias" and recording.exposure_s is None else recording.exposure_s
         out.append(replace(recording, kind="dark" if found == "bias" else found, exposure_s=exposure_s))
@@ -68,7 +69,9 @@ def _told(recording: Recording, root: Path) -> tuple[str, str | None]:
     if recording.kind in CALIBRATION:
         return recording.kind, None
     if recording.kind not in (None, "light"):
-        raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {recording.kind!r}; give kind=")
+        raise ValueError(
+            f"{recording.path}: expected kind 'dark' or 'flat', got {recording.kind!r}; give {setting('kind')}"
+        )
     names = names_of(recording.path, root)
     is_light = any(kind_of(name) == "light" for name in names)
     if is_light and recording.kind == "light":

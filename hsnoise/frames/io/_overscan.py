@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.arguments import span
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.io._recording import Recording
 from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
@@ -63,11 +64,13 @@ def with_overscan(stack: FrameStack, overscan: Overscan, read: Sequence[Recordin
     if overscan is not None and not isinstance(overscan, str):
         return _without(stack, [_given(overscan, stack.shape)])
     if overscan not in (None, "auto"):
-        raise ValueError(f"overscan: expected 'auto', None or spans of rows and columns, got {overscan!r}")
+        raise ValueError(f"{named('overscan')}: expected 'auto', None or spans of rows and columns, got {overscan!r}")
     strips = find(stack) or stated(stack, read)
     if overscan == "auto" and strips:
         return _without(stack, strips)
-    told = [f"{str(one).capitalize()} look like overscan: overscan='auto' takes them off" for one in strips]
+    told = [
+        f"{str(one).capitalize()} look like overscan: {setting('overscan', 'auto')} takes them off" for one in strips
+    ]
     return replaced(stack, assumed=(*stack.assumed, *told)) if told else stack
 
 
@@ -130,7 +133,9 @@ def levels_dn(stack: FrameStack, strips: Sequence[Strip]) -> np.ndarray:
 def _given(overscan: Any, shape: tuple[int, int]) -> Strip:
     """Spans of rows and columns as a strip. Raises ValueError unless it is one, at an edge."""
     if not isinstance(overscan, Sequence) or len(overscan) != 2:
-        raise ValueError(f"overscan: expected ((first row, end row), (first column, end column)), got {overscan!r}")
+        raise ValueError(
+            f"{named('overscan')}: expected ((first row, end row), (first column, end column)), got {overscan!r}"
+        )
     spans = [span("overscan", one, size) for one, size in zip(overscan, shape, strict=True)]
     narrow = [axis for axis, one in enumerate(spans) if one.stop - one.start < shape[axis]]
     if len(narrow) == 1:
@@ -139,8 +144,8 @@ def _given(overscan: Any, shape: tuple[int, int]) -> Strip:
         if strip.start == 0 or strip.stop == strip.size:
             return strip
     raise ValueError(
-        f"overscan: expected columns at an edge of all rows, or rows at an edge of all columns, got {overscan!r} for"
-        f" frames of {shape[0]} x {shape[1]}"
+        f"{named('overscan')}: expected columns at an edge of all rows, or rows at an edge of all columns, got"
+        f" {overscan!r} for frames of {shape[0]} x {shape[1]}"
     )
 
 

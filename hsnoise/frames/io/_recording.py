@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.lazy import LazyFrames
 
@@ -111,7 +112,7 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
     for name in ("exposure_s", "kind", "temperature_c"):
         values = np.atleast_1d(_in_seconds(metadata[name])).tolist() if name in metadata else [None] * len(groups)
         if len(values) != len(groups) and (len(values) > 1 or name == "exposure_s"):
-            raise ValueError(f"{name}: expected {len(groups)} values (one an exposure), got {len(values)}")
+            raise ValueError(f"{named(name)}: expected {len(groups)} values (one an exposure), got {len(values)}")
         per_group[name] = values * len(groups) if len(values) < len(groups) else values
     shared = {
         name: np.asarray(metadata[name]).tolist()

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.statistics.pixels.flags import counts_of, flags_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -110,7 +111,8 @@ def lit_darks(found: Survey) -> Iterator[str]:
             if rise > max(LIT_DN, LIT_NOISES * group.noise_dn) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
                 yield (
                     f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN and differ in that by {spread:.2g}"
-                    " of it: dark currents differ by more. Did light get in, or are they flats (kind='flat')?"
+                    " of it: dark currents differ by more. Did light get in, or are they flats"
+                    f" ({setting('kind', 'flat')})?"
                 )
                 break
 
