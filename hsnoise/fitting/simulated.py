@@ -18,7 +18,7 @@ import numpy as np
 from hsnoise._core.threads import in_threads
 from hsnoise._core.types import unit_in_words
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
-from hsnoise.fitting.maximise import gradient_at
+from hsnoise.fitting.gradients import gradient_at
 from hsnoise.fitting.notes import near_zero, parameter_notes
 from hsnoise.fitting.result import NOT_CONVERGED, FitResult
 from hsnoise.frames.stack import FrameStack

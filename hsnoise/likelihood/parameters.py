@@ -203,7 +203,7 @@ class Parameters(eqx.Module):
 
 
 def parameters_of(model: NoiseModel, effects: Iterable[str]) -> Parameters:
-    """The numbers of the effects called `effects`, less those that are held, as searches by simulated draws move them."""
+    """The numbers of the effects called `effects`, less those held, as searches by simulated draws move them."""
     return of_numbers(model, [n for n in numbers_of(model, effects) if not n.spec.holds(n.value_in(model))])
 
 
