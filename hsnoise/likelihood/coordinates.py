@@ -84,7 +84,7 @@ class Coordinates(Parameters):
 
 
 def _with_field(model: NoiseModel, effect: str, field: str, values) -> NoiseModel:
-    """The model with other values in a field, unchecked: they may be traced, or out of bounds on the way of a search."""
+    """The model with other values in a field, unchecked: traced, or out of bounds on the way of a search."""
     like = getattr(model[effect], field)
     return eqx.tree_at(lambda m: getattr(m[effect], field), model, values.reshape(like.shape))
 
