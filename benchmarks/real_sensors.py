@@ -65,9 +65,10 @@ def imx541(folder: Path, figure: Path) -> None:
 
 def draw_gain(result, path: Path) -> None:
     """Local gain (excess of a level's temporal variance over its signal) of the flats against signal."""
-    flats, physics = result.summary.flats, result.physics
-    signal = flats.mean_dn[:, 0] - physics.black_level[0]
-    floor = (physics.gain[0] * physics.read_noise) ** 2 + 1 / 12
+    flats, table = result.summary.flats, result.table
+    gain, read_noise_e, black_dn = (table[name][0] for name in ("gain", "read_noise.sigma", "black_level"))
+    signal = flats.mean_dn[:, 0] - black_dn
+    floor = (gain * read_noise_e) ** 2 + 1 / 12
     local = (flats.variance_dn2[:, 0] - floor) / signal
     error = flats.variance_dn2[:, 0] * np.sqrt(2 / flats.dof[:, 0]) / signal
     fig = Figure(figsize=(7, 4.2), layout="constrained")
@@ -76,7 +77,7 @@ def draw_gain(result, path: Path) -> None:
         signal, local, 2 * error, fmt="o", color="#0072b2", capsize=3, label="each flat level, 2 standard errors"
     )
     axis.axhline(REPORTED_GAIN, color="#d55e00", ls="--", label="reported, 0.4221 DN/e-")
-    axis.axhline(physics.gain[0], color="k", lw=1, label=f"joint fit, {physics.gain[0]:.4f} DN/e-")
+    axis.axhline(gain, color="k", lw=1, label=f"joint fit, {gain:.4f} DN/e-")
     axis.axhspan(REPORTED_GAIN * 0.98, REPORTED_GAIN * 1.02, color="#d55e00", alpha=0.1, label="reported, within 2 %")
     axis.set_xscale("log")
     axis.set_xlabel("signal above black (DN)")

@@ -24,7 +24,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hsnoise.likelihood.physics import evaluate, physics_of
 from rich.console import Console
 from rich.table import Table
 
@@ -33,6 +32,7 @@ from hsnoise.effects import ADC
 from hsnoise.enhance.training.noisy import camera_of
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, examples
+from hsnoise.likelihood.darks import evaluate, likelihood_part
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.likelihood.summary import summarise, without_counts
 
@@ -186,11 +186,11 @@ def likelihood(rounds: int) -> list[Line]:
 def likelihood_of(shape: tuple[int, int], rounds: int) -> Line:
     summary = summarise(dark_stack(32, shape, exposures=1))
     with jax.enable_x64(True):
-        physics = physics_of(model())
-        rules = jax.tree.map(jnp.asarray, plan_rules(physics, summary, CLOSE_MARGIN))
+        known = likelihood_part(model())
+        rules = jax.tree.map(jnp.asarray, plan_rules(known, summary, CLOSE_MARGIN))
         slope = eqx.filter_jit(jax.value_and_grad(evaluate))
         light = without_counts(summary)
-        times = medians({"hsnoise": lambda: slope(physics, light, rules)}, rounds)
+        times = medians({"hsnoise": lambda: slope(known, light, rules)}, rounds)
     what = f"32 frames of {shape[0]} x {shape[1]}, value and gradient"
     return Line("likelihood", what, "hsnoise", 1e3 * times["hsnoise"], "ms")
 

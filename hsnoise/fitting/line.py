@@ -343,8 +343,6 @@ def _result(estimate: _Estimate, correction: _Correction, setting: _Setting, sca
     has_gain = setting.is_line & (value.gain > 1.01 * LEAST_GAIN * most)
     has_rate = has_gain.any() & summary.exposure_s.any()
     has_black = summary.black_level_dn is not None or np.ptp(summary.exposure_s) > 0
-    infinite = np.full_like(value.black_level, np.inf)
-    black_error = np.zeros_like(infinite) if summary.black_level_dn is not None else error.black_level
     params = model_of(
         summary,
         gain=value.gain,
@@ -353,19 +351,18 @@ def _result(estimate: _Estimate, correction: _Correction, setting: _Setting, sca
         row_gain=(np.sqrt(np.clip(value.row_variance, 0.0, MOST_ROW_VARIANCE)), value.exponent),
         black_level=np.array(value.black_level),
     )
-    errors = {
-        ("gain", "value"): np.where(has_gain, error.gain, np.inf),
-        ("dark_current", "rate"): np.where(has_rate & has_black, error.dark_current, np.inf),
-        ("read_noise", "sigma"): np.where(
-            has_gain.any(), _root_error(value.read_variance, error.read_variance), np.inf
-        ),
-        ("row_gain", "sigma"): np.where(has_black, _root_error(value.row_variance, error.row_variance), np.inf),
-        ("row_gain", "exponent"): error.exponent,
-        ("black_level", "value"): black_error if has_black else infinite,
+    black_error = np.zeros(len(value.black_level)) if summary.black_level_dn is not None else error.black_level
+    known = {
+        ("gain", "value"): (has_gain, error.gain),
+        ("dark_current", "rate"): (has_rate & has_black, error.dark_current),
+        ("read_noise", "sigma"): (has_gain.any(), _root_error(value.read_variance, error.read_variance)),
+        ("row_gain", "sigma"): (has_black, _root_error(value.row_variance, error.row_variance)),
+        ("row_gain", "exponent"): (True, error.exponent),
+        ("black_level", "value"): (has_black, black_error),
     }
-    of_numbers = {n.name: float(errors[n.place][n.index]) for n in numbers_of(params) if n.place in errors}
+    errors = {n.name: float(np.where(*known[n.place], np.inf)[n.index]) for n in numbers_of(params) if n.place in known}
     notes = _notes(value, setting, correction, has_gain, has_black, len(scale) > 1, step)
-    return LineFit(params, of_numbers, notes)
+    return LineFit(params, errors, notes)
 
 
 def _root_error(variance, error):

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.compiling import jit_lean
 from hsnoise._core.memory import give_back_free_memory
+from hsnoise.fitting.gradients import gradient_at, likelihood_at, parameters_at, prior_at, rules_at
 from hsnoise.likelihood.coordinates import Coordinates
-from hsnoise.likelihood.darks import Rules, evaluate
+from hsnoise.likelihood.darks import Rules
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules, replan
 from hsnoise.likelihood.summary import Summary, every_nth_row, some_frames, without_counts
 from hsnoise.model import NoiseModel
@@ -166,12 +166,6 @@ def _on_device(tree):
     return jax.tree.map(jnp.asarray, tree)  # once, not with every gradient
 
 
-def rules_at(coordinates: Coordinates, vector, summary: Summary, **keywords) -> Rules:
-    """`plan_rules` for what a vector stands for."""
-    model, outliers = _parameters(coordinates, vector)[0]
-    return plan_rules(model, summary, outliers=outliers, **keywords)
-
-
 def _pieces(coordinates: Coordinates, vector, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
     """The likelihood in pieces that add up, those of darks and of flats: (summary, rules) for each.
 
@@ -199,7 +193,7 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
     """Values and gradients at `points`, summed over the pieces."""
     values, gradients = [], []
     for point in jnp.asarray(points):
-        value, gradient = (np.asarray(x) for x in _prior_at(coordinates, point))
+        value, gradient = (np.asarray(x) for x in prior_at(coordinates, point))
         for light, rules in pieces:
             weight = 1.0 if light.histograms else flats_weight
             of_piece, slope = likelihood_at(coordinates, point, light, rules)
@@ -226,11 +220,6 @@ def _chords(vector, whiten, gradients):
             return *best, steps
         steps += 1
         ahead = best[0] + length * step
-
-
-@eqx.filter_jit
-def _prior_at(coordinates, vector):
-    return jax.value_and_grad(coordinates.log_prior)(vector)
 
 
 def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
@@ -274,41 +263,11 @@ def _step(solver, y, told, state):
     return y, state, done
 
 
-def gradient_at(coordinates, vector, summary, rules):
-    """Log-likelihood plus prior, and its gradient.
-
-    Each rule has a program of its own: compiling one for all takes 200 MiB more.
-    """
-    dark = replace(summary, flats=None)
-    parts = [_prior_at(coordinates, vector), *(likelihood_at(coordinates, vector, dark, (rule,)) for rule in rules)]
-    if summary.flats is not None:
-        parts.append(likelihood_at(coordinates, vector, replace(summary, histograms=()), ()))
-    return tuple(map(sum, zip(*parts, strict=True)))
-
-
-@jit_lean
-def likelihood_at(coordinates, vector, summary, rules):
-    """Log-likelihood and its gradient."""
-
-    def value(at):
-        model, outliers = coordinates.at(at)
-        return evaluate(model, summary, rules, outliers)
-
-    return jax.value_and_grad(value)(vector)
-
-
 def _gradients(coordinates, summary, rules, points):
     """Values and gradients at `points`, one after the other."""
     found = [gradient_at(coordinates, point, summary, rules) for point in jnp.asarray(points)]
     values, gradients = zip(*found, strict=True)
     return np.asarray(values), np.asarray(gradients)
-
-
-@eqx.filter_jit
-def _parameters(coordinates, vector):
-    """(Model, outliers), values, their slopes over the coordinates, log prior."""
-    values = coordinates.values(vector)
-    return coordinates.with_values(values), values, coordinates.slope(vector), coordinates.log_prior(vector)
 
 
 def _curvature(coordinates, vector, whiten, gradients_at):
@@ -360,7 +319,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     nothing changes; its row is measured between two values off the bound within what the data resolve. `gradient_anew`
     plans the rules for a point: the nodes for rows without gain all lie at 1.
     """
-    slope = np.asarray(_parameters(coordinates, vector)[2])
+    slope = np.asarray(parameters_at(coordinates, vector)[2])
     active = ~_idle(coordinates, vector)
     inverse = np.linalg.inv(slope[active, None] * whiten[np.ix_(active, active)])
     information = np.zeros((len(vector), len(vector)))
@@ -369,7 +328,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     for i in at_bound:
         ends = [coordinates.put_inside(vector, i, depth) for depth in (0.0, 1.5)]
         gradients = [gradient_anew(end)[1][0] for end in ends]
-        at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends)
+        at_ends = (parameters_at(coordinates, jnp.asarray(e)) for e in ends)
         values, slopes = zip(*(map(np.asarray, at_end[1:3]) for at_end in at_ends), strict=True)
         low, high = (np.asarray(g) / s for g, s in zip(gradients, slopes, strict=True))
         row = -(high - low) / (values[1][i] - values[0][i])
@@ -394,7 +353,7 @@ def _is_positive(matrix: np.ndarray, places: list[int]) -> bool:
 
 
 def _ended(coordinates, vector, whiten, information, value, iterations, distance, close_sigma=CLOSE_SIGMA) -> Maximum:
-    (model, outliers), values, _, log_prior = jax.tree.map(np.asarray, _parameters(coordinates, vector))
+    (model, outliers), values, _, log_prior = jax.tree.map(np.asarray, parameters_at(coordinates, vector))
     return Maximum(
         model=model,
         outliers=outliers,

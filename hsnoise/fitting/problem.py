@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.fitting.maximise import gradient_at
+from hsnoise.fitting.gradients import gradient_at
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.coordinates import Coordinates, coordinates_for

@@ -59,9 +59,7 @@ class Coordinates(Parameters):
             if effect == OUTLIERS:
                 outliers = new
             else:
-                at = model.names.index(effect)
-                like = getattr(model[effect], field)
-                model = eqx.tree_at(lambda m, i=at, f=field: getattr(m.effects[i], f), model, new.reshape(like.shape))
+                model = _with_field(model, effect, field, new)
         return model, outliers
 
     def reach(self, vector) -> np.ndarray:
@@ -83,6 +81,12 @@ class Coordinates(Parameters):
         known = [np.nan if n.prior_centre is None else n.prior_centre for n in self.numbers]
         centre = jnp.where(np.isnan(known), self.start(), np.nan_to_num(known))
         return -0.5 * (((vector - centre) / np.array([n.prior_sigma for n in self.numbers])) ** 2).sum()
+
+
+def _with_field(model: NoiseModel, effect: str, field: str, values) -> NoiseModel:
+    """The model with other values in a field, unchecked: traced, or out of bounds on the way of a search."""
+    like = getattr(model[effect], field)
+    return eqx.tree_at(lambda m: getattr(m[effect], field), model, values.reshape(like.shape))
 
 
 def coordinates_for(summary: Summary, start: NoiseModel, outliers: np.ndarray | None = None) -> Coordinates:

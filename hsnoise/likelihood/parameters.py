@@ -101,7 +101,7 @@ def within_bounds(model: NoiseModel) -> NoiseModel:
     return model
 
 
-class Likelihood(NamedTuple):
+class Motion(NamedTuple):
     """How a field of an effect moves in a fit by likelihood: see `Number`."""
 
     transform: Transform
@@ -113,15 +113,15 @@ class Likelihood(NamedTuple):
 # In the order of the vector. Weak priors hold a direction in which the data say nothing, and move a parameter known to
 # 2 % by 1e-4 of its standard error. What may be zero bends to it within what the data resolve.
 IN_LIKELIHOOD = {
-    ("gain", "value"): Likelihood(transforms.LOGARITHM, 4.0, reach=2.0),
-    ("read_noise", "sigma"): Likelihood(transforms.LOGARITHM, 4.0, reach=2.0),
-    ("dark_current", "rate"): Likelihood(transforms.SOFTPLUS, 300.0),
-    ("row_gain", "sigma"): Likelihood(transforms.SOFTPLUS, 300.0, reach=5.0),
-    ("row_gain", "exponent"): Likelihood(transforms.IDENTITY, 2.0, prior_centre=0.5, reach=2.0),
-    ("row_gain", "white_share"): Likelihood(transforms.SOFTPLUS_BETWEEN, 300.0),
-    ("black_level", "value"): Likelihood(transforms.IDENTITY),
-    ("black_clamp", "rate"): Likelihood(transforms.IDENTITY),
-    (OUTLIERS, "share"): Likelihood(transforms.LOGARITHM, 4.0, reach=2.0),
+    ("gain", "value"): Motion(transforms.LOGARITHM, 4.0, reach=2.0),
+    ("read_noise", "sigma"): Motion(transforms.LOGARITHM, 4.0, reach=2.0),
+    ("dark_current", "rate"): Motion(transforms.SOFTPLUS, 300.0),
+    ("row_gain", "sigma"): Motion(transforms.SOFTPLUS, 300.0, reach=5.0),
+    ("row_gain", "exponent"): Motion(transforms.IDENTITY, 2.0, prior_centre=0.5, reach=2.0),
+    ("row_gain", "white_share"): Motion(transforms.SOFTPLUS_BETWEEN, 300.0),
+    ("black_level", "value"): Motion(transforms.IDENTITY),
+    ("black_clamp", "rate"): Motion(transforms.IDENTITY),
+    (OUTLIERS, "share"): Motion(transforms.LOGARITHM, 4.0, reach=2.0),
 }
 
 
@@ -203,7 +203,7 @@ class Parameters(eqx.Module):
 
 
 def parameters_of(model: NoiseModel, effects: Iterable[str]) -> Parameters:
-    """The numbers of the effects called `effects`, less those that are held, as searches by draws move them."""
+    """The numbers of the effects called `effects`, less those held, as searches by simulated draws move them."""
     return of_numbers(model, [n for n in numbers_of(model, effects) if not n.spec.holds(n.value_in(model))])
 
 
