@@ -35,7 +35,7 @@ from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import GREY, display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.enhance.mosaic import electrons_of
-from hsnoise.enhance.training.clips import LONG, Clip, check_sizes, crops, held_out, read_clips
+from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
@@ -308,7 +308,7 @@ def main(argv: list[str] | None = None) -> None:
         camera = camera_of(sensor, models["paper"])
         of: dict[str, list[dict[str, float]]] = {noise: [] for noise in NOISES}
         for seed, (train, kept) in enumerate(folds):
-            shown = [clip for clip in kept if not clip.name.endswith(LONG)]
+            shown = [clip for clip in kept if not clip.is_long]
             for noise in NOISES:
                 path = trained(camera, noise, models[noise], train, seed, options)
                 of[noise].append(measured(sensor, path, camera, shown, options.places))

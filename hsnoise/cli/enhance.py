@@ -27,7 +27,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, enhance
 
-RANGES = {"--brighten": (1e-3, 1e3), "--rate": (0.01, 1000.0)}
+RANGES = {"brighten": (1e-3, 1e3), "rate": (0.01, 1000.0)}
 CLEAN = 1 / 16  # of the least variance that a network was trained on: less is another kind of video
 BLOCK = 8  # pixels, so many that most of a picture is even within them
 
@@ -76,12 +76,12 @@ def _check(args: argparse.Namespace) -> None:
     if args.out.exists() and Path(args.video).exists() and args.out.samefile(args.video):
         raise ValueError(f"OUT: expected another file than IN, got {args.out}, which would be lost")
     for option, (low, high) in RANGES.items():
-        value = getattr(args, option.removeprefix("--"))
+        value = getattr(args, option)
         if not low <= value <= high:
-            raise ValueError(f"{option}: expected {low:g} to {high:g}, got {value:g}")
-    for option in ("--exposure", "--cfa"):
-        if args.camera is None and getattr(args, option.removeprefix("--")) is not None:
-            raise ValueError(f"{option}: goes with --camera, the camera of raw frames")
+            raise ValueError(f"--{option}: expected {low:g} to {high:g}, got {value:g}")
+    for option in ("exposure", "cfa"):
+        if args.camera is None and getattr(args, option) is not None:
+            raise ValueError(f"--{option}: goes with --camera, the camera of raw frames")
 
 
 def _check_network(args: argparse.Namespace, net: STLSTM, about: dict[str, Any], camera: NoiseModel | None) -> None:

@@ -73,7 +73,7 @@ def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | 
     """rest: what else --verbose tells."""
     return Page(
         conclusion=fit.conclusion,
-        doubts=_unsaid(fit.doubts, fit.conclusion),
+        doubts=fit.further_doubts,
         tables=(table_of(fit, truth),),
         notes=(f"{TITLES[fit.method]}: {fit.outcome}", *(f"- {note}" for note in fit.notes)),
         rest=rest,
@@ -106,7 +106,7 @@ def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
     fit = page_of_fit(story.fit, truth=truth)
     return Page(
         conclusion=story.conclusion,
-        doubts=_unsaid(story.fit.doubts, story.conclusion),
+        doubts=story.fit.further_doubts,
         tables=(_plain(story.as_table()), *fit.tables),
         notes=tuple(one for one in (story.care, *fit.notes) if one),
         rest=tuple(one for one in (*story.details, story.ended, story.split) if one),
@@ -123,10 +123,6 @@ def page_of_inspection(found: Inspection) -> Page:
         notes=(*parts["determined"], *parts["next"], *parts["assumed"]),
         rest=parts["budget"],
     )
-
-
-def _unsaid(doubts: tuple[str, ...], conclusion: Conclusion) -> tuple[str, ...]:
-    return tuple(doubt for doubt in doubts if doubt not in conclusion.sentence)
 
 
 def _light(conclusion: Conclusion, console: Console) -> Text:

@@ -32,7 +32,7 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     if held_out is None:
         return ""
     kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
-    return sentences.split(kept, held_out.n_frames)
+    return sentences.frames_apart(kept, held_out.n_frames)
 
 
 def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callable[[], None] = lambda: None) -> float:

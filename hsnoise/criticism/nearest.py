@@ -1,8 +1,8 @@
 """Which effects come nearest where none explains a capture: those that explain most of its statistics.
 
-Far off, the likelihood ratio of normal laws goes to whatever makes statistics scatter most. By Student's t instead,
-statistics that others will have to explain count alike however far off they are (Lange, Little, Taylor, "Robust
-statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
+Far off, the likelihood ratio of normal distributions goes to whatever makes statistics scatter most. By Student's t
+instead, statistics that others will have to explain count alike however far off they are (Lange, Little, Taylor,
+"Robust statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
 """
 
 from __future__ import annotations

@@ -255,7 +255,7 @@ def with_care(outcome: str) -> str:
     return f"Read its numbers with care, the last fit has {outcome}."
 
 
-def split(fitted: Sequence[int], held_out: Sequence[int]) -> str:
+def frames_apart(fitted: Sequence[int], held_out: Sequence[int]) -> str:
     """Which frames were fitted and which held out; fitted, held_out: dark frames of each exposure."""
     return (
         f"Fitted and compared were the first {_span(fitted)} dark frames of each exposure; held-out: the log-likelihood"

@@ -134,6 +134,11 @@ class FitResult:
         return Conclusion(Light.AMBER, "Usable, with doubts.", f"{first}{others}")
 
     @property
+    def further_doubts(self) -> tuple[str, ...]:
+        """The doubts that `conclusion` does not say."""
+        return self.doubts[1:] if self.converged else self.doubts
+
+    @property
     def has_gain(self) -> bool:
         """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
         return not any(number.name in self.withheld for number in numbers_of(self.params, ["gain"]))
@@ -249,10 +254,9 @@ class FitResult:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        conclusion = self.conclusion
         return _html.fragment(
-            _html.conclusion(conclusion),
-            _html.sentences(doubt for doubt in self.doubts if doubt not in conclusion.sentence),
+            _html.conclusion(self.conclusion),
+            _html.sentences(self.further_doubts),
             _html.paragraph(self._title),
             _html.printed(self._rounded_table()),
             _html.details(

@@ -61,7 +61,7 @@ class Inspection:
 
     @property
     def parts(self) -> dict[str, tuple[str, ...]]:
-        """What is printed, in lines: the capture, its groups, what is odd, budget, what can be had, what is next."""
+        """What is printed, in lines: the capture, its groups, what is odd, the budget, what can be had, what next."""
         return {
             "capture": (size_of(self.stack), f"  {levels_of(self.stack)}"),
             "groups": _table(self.groups),

@@ -29,7 +29,17 @@ class Clip:
     @property
     def source(self) -> str:
         """The video that it was cut from."""
-        return self.name.removesuffix(LONG)
+        return source_of(self.name)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it is a longer cut of a video."""
+        return self.source != self.name
+
+
+def source_of(name: str) -> str:
+    """The video that a clip of this name was cut from."""
+    return name.removesuffix(LONG)
 
 
 def read_clips(folder: Path | None) -> list[Clip]:

@@ -21,7 +21,7 @@ from skimage.metrics import structural_similarity
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear, light_of_frames, linear_from_display
-from hsnoise.enhance.training.clips import LONG, Clip, check_sizes, held_out, read_clips
+from hsnoise.enhance.training.clips import Clip, check_sizes, held_out, read_clips, source_of
 from hsnoise.enhance.training.noisy import OPTICS, Camera, camera_of, noisy_of
 from hsnoise.enhance.training.rivals import Denoiser, denoised, not_installed, rivals, tuned
 from hsnoise.enhance.training.steps import digest_of
@@ -100,7 +100,7 @@ def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: 
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
     if "clips" not in about:
         print(f"Note: {path} does not say which clips it was trained on; those scored may be among them")
-    names, digests = ({n.removesuffix(LONG) for n in about.get("clips", ())}, about.get("trained_on", ()))
+    names, digests = (set(map(source_of, about.get("clips", ()))), about.get("trained_on", ()))
     seen = sorted({clip.source for clip in scored if clip.source in names or digest_of(clip.frames) in digests})
     if seen:
         raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
@@ -247,7 +247,7 @@ def run(options: argparse.Namespace) -> None:
 
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
-    short = [clip for clip in kept if not clip.name.endswith(LONG)]
+    short = [clip for clip in kept if not clip.is_long]
     tasks = [(clip, float(level)) for clip in short for level in levels]
     records = []
     for number, (clip, level) in enumerate(track(tasks, "Scoring", console=Console(stderr=True))):
@@ -260,7 +260,7 @@ def run(options: argparse.Namespace) -> None:
             )
     # Without longer cuts, the clips themselves show how the memory fills.
     filling = {}
-    for number, clip in enumerate([c for c in kept if c.name.endswith(LONG)] or short):
+    for number, clip in enumerate([clip for clip in kept if clip.is_long] or short):
         filling[clip.name] = while_memory_fills(net, scene_of(clip, camera, middle, options.crop, 1000 + number))
     sheets = (*tables(records, camera.in_words), memory_sheet(filling))
     for sheet in (sheets[0], sheets[-1]):
