@@ -1,4 +1,4 @@
-"""The finding in one sentence, with a light: may it be used?"""
+"""The conclusion in one sentence, with a traffic light: can the result be used?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Light(StrEnum):
-    """Whether a result may be used."""
+    """Whether a result can be used."""
 
     GREEN = "green"  # it fits
     AMBER = "amber"  # with doubts
@@ -16,7 +16,7 @@ class Light(StrEnum):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What a reader should know first: `light`, and why in one `sentence`."""
+    """What a reader should know first: the `light`, and one `sentence` that says why."""
 
     light: Light
     sentence: str
