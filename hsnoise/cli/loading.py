@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-import hsnoise.frames.io
 from hsnoise._core.parsing import or_near
 from hsnoise.cli.options import CAMERAS
+from hsnoise.frames.io.load import load
 from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -75,8 +75,8 @@ def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
     """Several files or folders are one capture; several patterns, or folders with exposures of their own, one each."""
     is_one = all(Path(path).exists() for path in paths) and np.ndim(options["exposure_s"]) == 0
     if len(paths) > 1 and (is_one or all(Path(path).is_file() for path in paths)):
-        return [hsnoise.io.load(paths, **options)]
-    return [hsnoise.io.load(path, **options) for path in paths]
+        return [load(paths, **options)]
+    return [load(path, **options) for path in paths]
 
 
 def model_of(name: str, argument: str = "model") -> NoiseModel:
