@@ -1,5 +1,5 @@
-"""Progress: what is being done, since when, how much of it is left. In the terminal one line that is kept up to date;
-elsewhere a line at each new stage, and one every half minute.
+"""Progress: the stage, elapsed time, and time left. In a terminal one line that is kept up to date; elsewhere a line
+for each new stage, and one every half minute.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ _COUNTED = re.compile(r"(.*): (\d+)(?: of (\d+))?")
 
 
 class Account:
-    """What is being done, for a line of progress.
+    """The current stage, for a line of progress.
 
-    Called with the sentences that `improve` and others tell: "Adding row_noise", or "Adding row_noise: 12" and "Adding
-    row_noise: 12 of 60" after the 12th draw. What follows a semicolon stays at the end of the line.
+    Called with the sentences that `improve` and others report: "Adding row_noise", or "Adding row_noise: 12" and
+    "Adding row_noise: 12 of 60" after the 12th draw. Text after a semicolon stays at the end of the line.
     """
 
     def __init__(
         self, stage: str, minutes: float | None = None, of: str = "draw", clock: Callable[[], float] = time.monotonic
     ):
-        """minutes: after which the work is ended; of: what is counted."""
+        """minutes: time limit of the work; of: the unit that is counted."""
         self._of, self._clock, self._began = of, clock, clock()
         self._ends = None if minutes is None else self._began + 60 * minutes
         self._stage, self._stage_began, self._done, self._total = stage, self._began, 0, 0
         self._lock = threading.Lock()  # each thread that draws tells of it
 
     def tell(self, sentence: str) -> bool:
-        """Take note of a sentence; whether it is of a new stage."""
+        """Record a sentence; returns whether it begins a new stage."""
         found = _COUNTED.fullmatch(sentence)
         stage, done, total = (found[1], int(found[2]), int(found[3] or 0)) if found else (sentence, 0, 0)
         with self._lock:
@@ -57,7 +57,7 @@ class Account:
     def line(self, columns: int | None = None) -> str:
         """For example "[2:30] Adding row_noise, draw 34 of 60; error 26.3; about 1:10 left".
 
-        What stands in the middle is left out if the line would have more than so many columns.
+        The middle part is left out if the line would exceed `columns`.
         """
         what, *beside = self._stage.split("; ")
         if self._done:
@@ -67,7 +67,7 @@ class Account:
         return whole if columns is None or len(whole) <= columns else "; ".join([first, *left])
 
     def _left(self) -> list[str]:
-        """The time that is left, if it can be told, in words."""
+        """The time left in words, if it can be estimated."""
         now = self._clock()
         # What is finished in any case goes on beyond the end, nobody knows how long.
         until_end = [] if self._ends is None or self._ends <= now else [self._ends - now]
@@ -79,7 +79,7 @@ class Account:
 
 @contextmanager
 def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator[Callable[[str], Any]]:
-    """Say what is being done; the value takes the sentences of what is done next (see `Account`)."""
+    """Show the current stage; the value takes the sentences of later stages (see `Account`)."""
     account, console = Account(stage, minutes, of), Console(stderr=True)
     if console.is_terminal:
         with Progress(
@@ -104,7 +104,7 @@ def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator
 def fit_with_progress(
     stack: FrameStack, method: str, model: NoiseModel | None = None, pixels: str = "auto"
 ) -> FitResult:
-    """`hsnoise.fit`, telling of the frames that are read and of the time that the fit takes."""
+    """`hsnoise.fit` with progress: the frames read, and the time of the fit."""
     frames = sum(stack.n_frames)
     done = 0
 
@@ -119,7 +119,7 @@ def fit_with_progress(
 
 
 class _Line(ProgressColumn):
-    """The line of an account."""
+    """The progress line of an account."""
 
     def __init__(self, account: Account, columns: int):
         super().__init__()
@@ -131,7 +131,7 @@ class _Line(ProgressColumn):
 
 @contextmanager
 def _repeated(say: Callable[[], None]) -> Iterator[None]:
-    """Call `say` every half minute, however long what is within takes."""
+    """Call `say` every half minute inside this context."""
     ended = threading.Event()
 
     def repeat() -> None:
