@@ -120,7 +120,7 @@ def stl1001(folder: Path) -> None:
 
 
 def improved(folder: Path, only: list[str]) -> None:
-    """Print the story of `hsnoise.improve` on the darks of each sensor, or of `only` these; for CCDs on part of them."""
+    """Print the story of `hsnoise.improve` on the darks of each sensor, or of `only` these; for CCDs on a part."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
     names = [name for name in data.files if name.startswith("dark")]

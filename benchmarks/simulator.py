@@ -1,8 +1,7 @@
 """A simulator, in NumPy, of dark captures with a hidden effect; it shares no code with hsnoise.
 
-`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]; `effect` may be a pair of effects.
-Amplitude 1 is typical of a modest real sensor; details (period, corner, taps) are drawn
-from `rng`.
+`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]; `effect` may be a pair.
+Amplitude 1 is typical of a modest real sensor; details (period, corner, taps) are drawn from `rng`.
 """
 
 from __future__ import annotations
