@@ -31,7 +31,7 @@ def fading_power(n: int, exponent: Scalar) -> jax.Array:
 def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None = None) -> jax.Array:
     """Spectrum [n] of a row gain: a power law without DC term plus a share of white noise with one (None: no share).
 
-    Without a share the mean over all rows is exactly 1, whatever the exponent.
+    Without a share the mean over all rows is exactly 1 for any exponent.
     """
     coloured = power_law(n, exponent)
     return coloured if white_share is None else (1 - white_share) * coloured + white_share

@@ -33,7 +33,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         said = re.sub(r"invalid (int|float) value: (.*)", lambda m: f"expected {_KINDS[m[1]]}, got {m[2]}", message)
         if "required" in said:
-            said += f" ({self.prog} --help tells of them)"
+            said += f" ({self.prog} --help lists them)"
         self.exit(2, f"hsnoise: {said.removeprefix('argument ')}\n")
 
     def _check_options(self, words: Sequence[str]) -> None:

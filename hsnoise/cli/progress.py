@@ -21,9 +21,9 @@ from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 
-EVERY_S = 30.0  # where there is no terminal
-SPINNER = 2  # columns, with the space behind it
-LEAST_S = 5.0  # of a stage, before its rate says when it ends
+EVERY_S = 30.0  # without a terminal
+SPINNER = 2  # columns, including the space after it
+LEAST_S = 5.0  # of a stage, before its rate predicts its end
 _COUNTED = re.compile(r"(.*): (\d+)(?: of (\d+))?")
 
 
@@ -41,7 +41,7 @@ class Account:
         self._of, self._clock, self._began = of, clock, clock()
         self._ends = None if minutes is None else self._began + 60 * minutes
         self._stage, self._stage_began, self._done, self._total = stage, self._began, 0, 0
-        self._lock = threading.Lock()  # each thread that draws tells of it
+        self._lock = threading.Lock()  # every drawing thread reports progress
 
     def tell(self, sentence: str) -> bool:
         """Record a sentence; returns whether it begins a new stage."""
@@ -69,7 +69,7 @@ class Account:
     def _left(self) -> list[str]:
         """The time left in words, if it can be estimated."""
         now = self._clock()
-        # What is finished in any case goes on beyond the end, nobody knows how long.
+        # Work that is always finished may run past the limit, for an unknown time.
         until_end = [] if self._ends is None or self._ends <= now else [self._ends - now]
         taken = now - self._stage_began
         if self._total > self._done > 0 and taken >= LEAST_S:

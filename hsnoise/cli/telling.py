@@ -20,7 +20,7 @@ from hsnoise.fitting.result import TITLES, FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.structure import explained
 
-LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
+LINES, COLUMNS = 40, 100  # assumed without a terminal; LINES is also the maximum
 OPTIONS = {
     "exposure_s": "--exposure",
     "black_level": "--black-level",
@@ -169,7 +169,7 @@ def _plain(table: Table) -> Table:
     return table
 
 
-Printed = tuple[str, int]  # what is printed, and how many lines of the screen that takes
+Printed = tuple[str, int]  # printed text and its number of screen lines
 
 
 def _printed(text: Text, console: Console) -> Printed:

@@ -32,7 +32,7 @@ def looks_like_a_mosaic(frame: np.ndarray) -> bool:
     blocks_of_rows = frame[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)
     # Only part of a large frame: as floats, all of it would take many times its memory.
     pixels = blocks_of_rows[:: -(-rows * columns // MOST_PIXELS)].astype(float)
-    # Hot pixels would mask what all others have in common.
+    # Hot pixels would mask the pattern of all others.
     low, high = np.quantile(pixels, (0.001, 0.999))
     pixels = np.clip(pixels, low, high)
     squares = (pixels - pixels.mean((0, 2), keepdims=True)) ** 2

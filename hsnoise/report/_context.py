@@ -187,7 +187,7 @@ def _along(value: float, low: float, high: float) -> str:
 def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Rows of the ranking table; `width` is the length of a score's bar in percent."""
     shown = diagnosis.ranking[:MOST_CANDIDATES]
-    largest = max(10.0, *(c.score for c in shown))  # what chance gives makes no long bar
+    largest = max(10.0, *(c.score for c in shown))  # keeps bars of chance scores short
     return [
         {
             "name": c.name,
