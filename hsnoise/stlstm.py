@@ -124,7 +124,7 @@ class State(eqx.Module):
 class STLSTM(eqx.Module):
     """The enhancer: features of blocks of stride x stride pixels, ST-LSTM layers, and a convolution back to pixels.
 
-    A skip connection adds the features to the output. Frames come in as linear light, in which noise averages out, and
+    A skip connection adds the features to the last layer. Frames come in as linear light, in which noise averages out, and
     leave as display values, in which errors look as large as they are.
 
     Attributes:
@@ -189,7 +189,7 @@ class STLSTM(eqx.Module):
         rows, columns = frames.shape[1:3]
         missing = [(-n) % self.stride for n in (rows, columns)]
         padded = jnp.pad(frames, ((0, 0), (0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
-        features = self.features(to_blocks(jnp.arcsinh(padded), self.stride))  # noise may exceed white many times
+        features = self.features(to_blocks(jnp.arcsinh(padded), self.stride))  # noise may be several times white
         x, memory, hidden, cell = features, state.memory, [], []
         for layer, h, c in zip(self.cells, state.hidden, state.cell, strict=True):
             x, c, memory = layer(x, h, c, memory)

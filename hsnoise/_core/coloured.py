@@ -15,7 +15,7 @@ from hsnoise._core.types import RandomKey, Scalar
 def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
     """Spectrum [n] of power k^-exponent at k = 1 ... n/2 cycles, `dc` at k = 0, scaled to a mean of 1.
 
-    The dtype is that of the exponent. A series of length 1 has only k = 0: its power is `dc`.
+    The dtype is that of the exponent. A series of length 1 has only k = 0: power 0 without `dc`.
     """
     k = jnp.abs(jnp.fft.fftfreq(n, 1 / n)).astype(exponent.dtype)
     power = jnp.where(k == 0, dc, jnp.exp(-exponent * jnp.log(jnp.maximum(k, 1.0))))
