@@ -124,8 +124,8 @@ class State(eqx.Module):
 class STLSTM(eqx.Module):
     """The enhancer: features of blocks of stride x stride pixels, ST-LSTM layers, and a convolution back to pixels.
 
-    A skip connection adds the features to the last layer. Frames come in as linear light, in which noise averages out, and
-    leave as display values, in which errors look as large as they are.
+    A skip connection adds the features to the last layer. Frames come in as linear light, in which noise averages out,
+    and leave as display values, in which errors look as large as they are.
 
     Attributes:
         stride: side of the blocks; kernels: kernel size of each layer; maps: feature maps; channels: of a frame.
