@@ -1,4 +1,4 @@
-"""Fits of real sensors whose captures lie in a folder outside the project (HSNOISE_SHARED, or ../shared).
+"""Fits of real sensors, with captures from a folder outside the project (HSNOISE_SHARED, or ../shared).
 
     python -m benchmarks.real_sensors
     python -m benchmarks.real_sensors --improve
@@ -6,7 +6,7 @@
 IMX541 (darks and flats): gain and read noise beside the values that the source reports, and the local gain against
 signal as a figure. TC-237 (bias frames clipped at 0): clipped fraction, whole frame and by thirds of the columns.
 STL-1001 (darks at two temperatures, flats): dark current. With --improve instead: what the paper's model lacks in each,
-told by `hsnoise.improve`, and the dark means of an A7S2 against exposure as a figure.
+according to `hsnoise.improve`, and the dark means of an A7S2 against exposure as a figure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 import hsnoise
 from hsnoise.cli.progress import busy
 
-ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 have in common
+ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 share
 REPORTED_GAIN, REPORTED_READ_NOISE_E = 0.422149, 1.98
 
 
@@ -121,7 +121,7 @@ def stl1001(folder: Path) -> None:
 
 
 def improved(folder: Path, only: list[str]) -> None:
-    """The story of `hsnoise.improve` on the darks of each sensor, or of `only` these; on a part of a CCD's frames."""
+    """Print the story of `hsnoise.improve` on the darks of each sensor, or of `only` these; for CCDs on a part."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
     names = [name for name in data.files if name.startswith("dark")]
@@ -142,7 +142,7 @@ def improved(folder: Path, only: list[str]) -> None:
 
 
 def a7s2(folder: Path, path: Path) -> None:
-    """Mean of dark frames above black against exposure: it falls where the camera subtracts more than there is."""
+    """Mean of dark frames above black against exposure; it falls if the camera subtracts too much."""
     data = np.load(folder / "a7s2_dark_mean_ladder.npz")
     order = np.argsort(data["exposure_s"])
     exposure_s, means = data["exposure_s"][order], data["mean_minus_black_dn"][:, order]
@@ -165,7 +165,7 @@ def a7s2(folder: Path, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figure", type=Path, default=Path("docs/figures/imx541_gain.png"))
-    parser.add_argument("--improve", action="store_true", help="what the paper's model lacks in each sensor")
+    parser.add_argument("--improve", action="store_true", help="find what the paper's model lacks for each sensor")
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="SENSOR", help="with --improve: IMX541, TC-237, STL-1001"
     )

@@ -1,4 +1,4 @@
-"""The same work on many things, on all cores."""
+"""The same work on many items, on all cores."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from threadpoolctl import ThreadpoolController
 
 
 def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:
-    """`function(argument)` for each, on all cores; results in order. NumPy and JAX let other threads work."""
+    """`function(argument)` for each, on all cores; results in order. NumPy and JAX release Python's lock."""
 
     def one(argument):
         result = function(argument)

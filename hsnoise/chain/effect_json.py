@@ -1,4 +1,4 @@
-"""An effect as JSON, numbers with their units."""
+"""Effects as JSON, numbers with their units."""
 
 from __future__ import annotations
 

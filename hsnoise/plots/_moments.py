@@ -1,4 +1,4 @@
-"""What the fitted model expects of the mean and the variance of counts, clipping and rounding included."""
+"""Mean and variance of counts expected by the fitted model, including clipping and rounding."""
 
 from __future__ import annotations
 

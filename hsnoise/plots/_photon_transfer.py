@@ -26,13 +26,12 @@ CURVE_POINTS = 40
 def photon_transfer(fit) -> Figure:
     """Variance against mean of the counts, measured and fitted: the photon transfer curve.
 
-    Darks: one point per exposure and colour, its variance taken within rows, so that row offsets and the spread
-    of row gains between rows do not enter, nor do pixels far hotter than all others. Where pixels differ, that is no
-    noise: there, classes of pixels over time are shown (`pixel_transfer`). Flats: one point per level and
-    colour, temporal variance within rows above that of the darks; and that over signal, with the curve that was fitted
-    and the gain that follows from it at each signal. Solid: what the fitted model expects of the recorded counts;
-    dashed, where clipping matters: what the sensor delivered before it was clipped. Hollow points: more than 0.1 % of
-    the pixels are clipped, or a level was left out.
+    Darks: one point per exposure and colour, with the variance within rows. Row offsets, the spread of row gains and
+    pixels far hotter than all others do not enter. Where pixels differ, that variance is not noise, and classes of
+    pixels over time are shown instead (`pixel_transfer`). Flats: one point per level and colour, temporal variance
+    within rows above that of the darks; and that variance over signal, with the fitted curve and the local gain.
+    Solid: the fitted model of the recorded counts. Dashed, where clipping matters: the model before clipping. Hollow
+    points: more than 0.1 % of the pixels are clipped, or the level was left out.
 
     Args:
         fit: result of `hsnoise.fit`.
@@ -44,7 +43,7 @@ def photon_transfer(fit) -> Figure:
     """
     panels = _panels(fit)
     if not panels:
-        raise ValueError("fit: where pixels differ, photon transfer needs darks of two exposures, or flats")
+        raise ValueError("fit: expected darks of two exposures, or flats, because pixels differ; got neither")
     title = "Photon transfer: variance against mean of the counts"
     title = title_of(title, fit) if fit.transfer is None else title
     figure = new_figure(6.4 * len(panels), 5.0, title)
@@ -125,7 +124,7 @@ def _flats(axes: Axes, model: NoiseModel, summary: Summary) -> None:
 
 
 def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
-    """Variance over signal of the flats and the local gain: level where the response is straight."""
+    """Variance over signal of the flats and the local gain: horizontal where the response is linear."""
     axes.set_title("flat frames: gain against signal", fontsize=10)
     axes.set_ylabel("variance over signal, gain / (DN/e$^-$)")
     found = flat_gain_of(model, summary.flats)
@@ -148,7 +147,7 @@ def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
 
 
 def _gain_limits(axes: Axes, found: FlatGain) -> None:
-    """Limits by the levels that gave the gain: those near saturation may fall far below."""
+    """Limits from the levels that gave the gain: levels near saturation may fall far below."""
     shown = found.level_gain[found.used]
     if shown.size:
         low, high = min(shown.min(), found.gain.min()), max(shown.max(), found.gain.max())
@@ -157,7 +156,7 @@ def _gain_limits(axes: Axes, found: FlatGain) -> None:
 
 
 def _levels(found: FlatGain, c: int) -> tuple[np.ndarray, np.ndarray]:
-    """Signals, DN, of the levels of a channel that can be drawn, and where they are [level]."""
+    """Signals, DN, of a channel's levels that can be drawn, and the mask that selects them [level]."""
     shown = np.isfinite(found.level_gain[:, c]) & (found.level_gain[:, c] > 0)
     return found.signal_dn[shown, c], shown
 
@@ -173,7 +172,7 @@ def _points(axes: Axes, channel: str, x, y, clipped, error) -> None:
 def _within_rows(histograms: RowHistograms, far: np.ndarray):
     """Mean (DN), variance within rows (DN^2) and its standard error over frames, each [exposure].
 
-    far [exposure]: whether pixels beyond all bins, far hotter than the others, are to be left out.
+    far [exposure]: whether to leave out pixels beyond all bins, far hotter than the others.
     """
     pixels = histograms.row_pixels  # [exposure, frame, row]; 0 in padding
     used = pixels[..., 0] > 0
@@ -213,7 +212,7 @@ def _expected(model: NoiseModel, c: int, exposure_s, white_level_dn: float | Non
 
 
 def _unclipped(model: NoiseModel, c: int, exposure_s):
-    """Mean above black and variance within rows of counts that nothing clips."""
+    """Mean above black and variance within rows of counts before clipping."""
     signal = float(model["gain"].value[c]) * float(dark_current(model)) * exposure_s
     return signal, _line(model, c, signal)
 

@@ -16,9 +16,9 @@ from hsnoise.plots._pixel_transfer import transfers_of
 from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy, title_of
 
 BANDS_PER_OCTAVE = 3
-SHOWN_IN_DARKS = 1e-3  # row gain that flats may know, but no dark shows, is below
+SHOWN_IN_DARKS = 1e-3  # smaller row gains are invisible in darks; flats may still determine them
 SMALLEST_SIGMA = 1e-6
-FAINT = 0.01  # of the least power that is measured: a row gain below that is left out
+FAINT = 0.01  # of the smallest measured power: a weaker row gain is left out
 ALONE = "row gain alone"
 LEGEND = ("measured", "measured, in bands", "fitted: row gain + pixel noise", ALONE, "pixel noise alone")
 
@@ -26,22 +26,22 @@ LEGEND = ("measured", "measured, in bands", "fitted: row gain + pixel noise", AL
 def row_spectrum(fit) -> Figure:
     """Power spectrum of the row gain along the rows, measured and fitted, log-log; one panel per colour.
 
-    Measured: the periodogram of row means, divided by how strongly the mean of a row depends on its gain, averaged
-    over the frames of the exposure that shows the row gain best. What a row has in all frames (hot pixels, fixed
-    patterns) is no row gain and is taken off, unless there is one frame. Fitted: row gain plus what the noise of the
-    pixels leaves in a row mean. Power is normalised so that its mean over all frequencies is the variance over rows.
+    Measured: the periodogram of row means, divided by the response of a row mean to its gain, averaged over the frames
+    of the exposure that shows the row gain best. Each row's mean over frames (hot pixels, fixed patterns) is not row
+    gain and is subtracted, unless there is a single frame. Fitted: row gain plus the pixel noise in a row mean. Power
+    is normalised so that its mean over all frequencies is the variance over rows.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.
 
     Raises:
-        ValueError: there are no dark frames, no row gain in the model, or no dark signal that would show it.
+        ValueError: there are no dark frames, no row gain in the model, or no dark signal to show it.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019, Fig. 3.
     """
     summary = fit.summary
     if not has_row_spectrum(fit):
-        raise ValueError("fit: a row spectrum needs dark frames, row_gain in the model, and dark signal that shows it")
+        raise ValueError("fit: a row spectrum needs dark frames, row_gain in the model, and dark signal to show it")
     channels = len(summary.histograms)
     title = title_of("Spectrum of the row gain", fit) if fit.transfer is None else "Spectrum of the row gain"
     figure = new_figure(max(4.3 * channels, 6.4), 4.6, title)
@@ -63,7 +63,7 @@ def row_spectrum(fit) -> Figure:
 
 
 def has_row_spectrum(fit) -> bool:
-    """Whether the frames show the row gain; where pixels differ, only one that is large enough for darks to show."""
+    """Whether the frames show the row gain; where pixels differ, only if it is large enough to show in darks."""
     if not fit.summary.histograms or "row_gain" not in fit.params:
         return False
     if fit.transfer is None:
@@ -111,7 +111,7 @@ def _count(frames: int) -> str:
 
 
 def _response(fit, c: int, histograms: RowHistograms):
-    """Change of a row's mean with its gain (DN) and variance of a row mean from its pixels (DN^2): [exposure]."""
+    """Change of a row's mean with its gain (DN), and variance of a row mean from its pixels (DN^2): [exposure]."""
     summary = fit.summary
     sigma = max(float(fit.params["row_gain"].sigma[c]), 1e-3)
     beta, weight = beta_rule(sigma)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 
 import hsnoise
 from hsnoise import effects as fx
@@ -20,7 +21,6 @@ from hsnoise.chain.effect_json import effect_from_json, effect_to_json
 from hsnoise.criticism.candidates import built_in, can_be_proposed, facts_of, given, made
 from hsnoise.criticism.improve import _is_there
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, CaptureFacts, Places
-from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.statistics.decomposition import COMPONENTS, PlaneSums
 
