@@ -132,7 +132,7 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert float(lines["gain.R"][4]) == pytest.approx(1.53, abs=0.05)
     assert lines["black_level.R"][2] == "held"
     assert {path.name for path in out.iterdir()} >= {"capture.npz", "model.json", "table.csv", "story.png"}
-    assert "truth" in said and "Hidden in these frames was row_noise" in said
+    assert "truth" in said and "The hidden effect was row_noise" in said
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 

@@ -349,7 +349,7 @@ def test_the_command_line_writes_it(tmp_path, monkeypatch, compared, capsys):
     out = tmp_path / "out"
     arguments = ["--model", str(tmp_path / "model.json"), "--out", str(out), "--report", str(out / "report.html")]
     assert main(["compare", str(darks), *arguments, "--debug"]) == 0
-    assert f"Reported in {out / 'report.html'}" in capsys.readouterr().out
+    assert f"Report: {out / 'report.html'}" in capsys.readouterr().out
     assert "darks.npz" in (out / "report.html").read_text()
     assert sorted(path.name for path in out.iterdir()) == ["comparison.png", "report.html"]
 

@@ -1,4 +1,4 @@
-"""The finding in one sentence, with a light: may it be used?"""
+"""The conclusion in one sentence, with a traffic light: can the result be used?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Light(StrEnum):
-    """Whether a result may be used."""
+    """Whether a result can be used."""
 
     GREEN = "green"  # it fits
     AMBER = "amber"  # with doubts

@@ -1,4 +1,4 @@
-"""Array aliases and the colour filter array: what every layer above agrees on.
+"""Array types and the colour filter array, shared by every package.
 
 Shapes are named by jaxtyping: `frame`, `row`, `column`, `channel`. A channel is a colour; the two greens of a
 Bayer sensor are one channel.
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key, UInt, UInt32
 from hsnoise._core.naming import named
 
 Scalar = Float[Array, ""]
-PerChannel = Float[Array, "*channel"]  # a scalar until the model spreads it over its channels
+PerChannel = Float[Array, "*channel"]  # a scalar until the model broadcasts it to its channels
 Frames = Float[Array, "frame row column"]
 FrameRows = Float[Array, "frame row channel"]  # one number for each row of each colour
 PixelMap = Float[Array, "1 row column"]
@@ -31,8 +31,8 @@ SHUTTERS = ("rolling", "global")
 class StatedGain:
     """The gain that a file's header states.
 
-    `source` quotes the header ("EGAIN 2.62 e-/DN"). `certain`: the keyword means electrons per DN and nothing else;
-    GAIN is often the number of a setting.
+    `source` quotes the header ("EGAIN 2.62 e-/DN"). `certain`: the keyword can only mean electrons per DN;
+    GAIN is often just the number of a setting.
     """
 
     value_dn_per_e: float
@@ -41,7 +41,7 @@ class StatedGain:
 
 
 def unit_in_words(unit: str) -> str:
-    """The unit as it stands behind a number: nothing for "1"."""
+    """The unit as written after a number: empty for "1"."""
     return "" if unit == "1" else unit
 
 
@@ -81,5 +81,5 @@ def check_shutter(shutter: str) -> None:
 
 
 def is_traced(x) -> bool:
-    """True if `x` has no value yet, inside jit, vmap or grad; its values cannot be checked then."""
+    """True if `x` has no value yet (inside jit, vmap or grad) and cannot be checked."""
     return isinstance(x, jax.core.Tracer)

@@ -36,16 +36,17 @@ from hsnoise.criticism import Comparison
 from hsnoise.criticism.compare import DRAWS
 from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
-from hsnoise.simulation.draws import check_fits, part_of
+from hsnoise.simulation.draws import check_fits
+from hsnoise.simulation.portion import Portion
 
 MEANING = """\
-One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
-reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
-`row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
-errors do not say: whether the model is right."""
-ASSUMED = 4  # sentences on the capture that are told before the work
+One electron adds `gain` DN to a count. A pixel collects `dark_current.rate` electrons per second without light, and \
+reading it adds noise of `read_noise.sigma` electrons. The gain fluctuates from row to row and from frame to frame by \
+`row_gain.sigma` of itself (streaks): white noise if the exponent is 0, 1/f noise if it is 1. The standard errors \
+do not say whether the model is right."""
+ASSUMED = 4  # assumptions about the capture that are printed before the work
 LOOK = dict.fromkeys(Method, "Look at the residuals in histograms.png, and run {}")
-LOOK[Method.SYNTHETIC] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
+LOOK[Method.SYNTHETIC] = "Run {}, which draws them. Figures of the fit are left out: they would lack the added effects."
 # Arguments of the library, and what its sentences call them here.
 OPTIONS = {
     "exposure_s": "--exposure",
@@ -62,20 +63,20 @@ OPTIONS = {
     "params": "--model",
     "seed": "--seed",
 }
-BROKEN_PIPE = 128 + 13  # as a shell has it of those whom SIGPIPE ended
+BROKEN_PIPE = 128 + 13  # a shell's exit code for a process ended by SIGPIPE
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, 1 if a capture makes no fit, or 2 after an error, told in a sentence.
+    """Run a command. Exit codes: 0; 1 if a fit of the capture makes no sense; 2 after an error, printed in a sentence.
 
-    141 if nobody reads what it prints, 130 after Ctrl-C.
+    141 if the reader of the output is gone; 130 after Ctrl-C.
     """
     _interrupting.on_disk("")
     try:
         try:
             return _run(argv)
         finally:
-            sys.stdout.flush()  # a reader that is gone is noted here, not while Python ends
+            sys.stdout.flush()  # notice a closed pipe here, not while Python shuts down
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
@@ -129,7 +130,7 @@ def _inspect(args: argparse.Namespace) -> int:
 def _fit(args: argparse.Namespace) -> None:
     check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
-    args.out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
+    args.out.mkdir(parents=True, exist_ok=True)  # fail before the long work
     fit = fit_with_progress(stack, args.method, model, args.pixels)
     written = write_results(fit, args.out, {"files": args.paths})
     if args.maps is not None:
@@ -152,10 +153,10 @@ def _compare(args: argparse.Namespace) -> None:
 def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args)
-    part_of(stack)  # flats alone are no capture to diagnose: said before the fit
+    Portion.of(stack)  # rejects a capture of flats alone before the fit
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = fit_with_progress(stack, args.method) if args.model is None else model_of(args.model)
-    text = "Drawing every effect that may be missing"
+    text = "Drawing each effect that may be missing"
     with busy(text) as say:
         found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, Event(text)))
     more: dict[str, Any] = {"fit": fitted}
@@ -179,7 +180,7 @@ def _improve(args: argparse.Namespace) -> None:
 
 
 def _load(args: argparse.Namespace) -> FrameStack:
-    """The capture, checked; what was assumed about it is printed."""
+    """The capture, checked; prints what was assumed about it."""
     stack = load_capture(args.paths, args)
     stack.check()
     shown = stack.assumed if args.verbose else stack.assumed[:ASSUMED]
@@ -199,15 +200,15 @@ def _compared(model, stack: FrameStack, seed: int) -> Comparison:
 def _show(
     args: argparse.Namespace, found, page: Page, figure: str, stack: FrameStack, foot: tuple[str, ...] = (), **more: Any
 ) -> None:
-    """Draw the figure of a finding, write its report, and print its page."""
+    """Draw the figure of a result, write its report, and print its page."""
     write_figure(args.out / figure, found.plot())
     _write_report(args, found, stack, **more)
-    reported = [] if args.report is None else [f"Reported in {args.report}"]
-    tell(page, [*foot, f"Drawn in {args.out / figure}", *reported], args.verbose)
+    reported = [] if args.report is None else [f"Report: {args.report}"]
+    tell(page, [*foot, f"Figure: {args.out / figure}", *reported], args.verbose)
 
 
 def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords: Any) -> None:
-    """Write the page that --report asks for, if it does."""
+    """Write the page if --report asks for it."""
     if args.report is None:
         return
     with busy("Writing the report"):
@@ -218,7 +219,7 @@ def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Before long work, so that it cannot be in vain."""
+    """Raise errors about outputs before the long work."""
     check_folder(args.out)
     if args.report is not None:
         report.check_path(args.report, made=args.out)

@@ -1,5 +1,5 @@
-"""Progress: what is being done, since when, how much of it is left. In the terminal one line that is kept up to date;
-elsewhere a line at each new stage, and one every half minute.
+"""Progress: the stage, elapsed time, and time left. In a terminal one line that is kept up to date; elsewhere a line
+for each new stage, and one every half minute.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 
-EVERY_S = 30.0  # where there is no terminal
-SPINNER = 2  # columns, with the space after it
-LEAST_S = 5.0  # of a stage, before its rate says when it ends
+EVERY_S = 30.0  # without a terminal
+SPINNER = 2  # columns, including the space after it
+LEAST_S = 5.0  # of a stage, before its rate predicts its end
 
 
 class Account:
-    """What is being done, for a line of progress."""
+    """The current stage, for a line of progress."""
 
     def __init__(
         self, stage: Event, minutes: float | None = None, of: str = "draw", clock: Callable[[], float] = time.monotonic
     ):
-        """minutes: after which the work is ended; of: what is counted."""
+        """minutes: time limit of the work; of: the unit that is counted."""
         self._of, self._clock, self._began = of, clock, clock()
         self._ends = None if minutes is None else self._began + 60 * minutes
         self._now, self._stage_began = stage, self._began
-        self._lock = threading.Lock()  # each thread that draws tells of it
+        self._lock = threading.Lock()  # every drawing thread reports progress
 
     def tell(self, event: Event) -> bool:
-        """Take note of an event; whether it is of a new stage."""
+        """Record an event; returns whether it begins a new stage."""
         with self._lock:
             is_new = (event.stage, event.beside) != (self._now.stage, self._now.beside)
             if is_new:
@@ -52,7 +52,7 @@ class Account:
     def line(self, columns: int | None = None) -> str:
         """For example "[2:30] Adding row_noise, draw 34 of 60; error 26.3; about 1:10 left".
 
-        What stands in the middle is left out if the line would have more than so many columns.
+        The middle part is left out if the line would exceed `columns`.
         """
         now = self._now
         what = f"[{_clock(self._clock() - self._began)}] {now.stage}"
@@ -63,9 +63,9 @@ class Account:
         return whole if columns is None or len(whole) <= columns else "; ".join([what, *left])
 
     def _left(self) -> list[str]:
-        """The time that is left, if it can be told, in words."""
+        """The time left in words, if it can be estimated."""
         now = self._clock()
-        # What is finished in any case goes on beyond the end, nobody knows how long.
+        # Work that is always finished may run past the limit, for an unknown time.
         until_end = [] if self._ends is None or self._ends <= now else [self._ends - now]
         taken, done, total = now - self._stage_began, self._now.done, self._now.total or 0
         if total > done > 0 and taken >= LEAST_S:
@@ -75,7 +75,7 @@ class Account:
 
 @contextmanager
 def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator[Callable[[Event], Any]]:
-    """Say what is being done; the value takes the events of what is done next."""
+    """Show the current stage; the value takes the events of later stages."""
     account, console = Account(Event(stage), minutes, of), Console(stderr=True)
     if console.is_terminal:
         with Progress(
@@ -100,7 +100,7 @@ def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator
 def fit_with_progress(
     stack: FrameStack, method: str, model: NoiseModel | None = None, pixels: str = "auto"
 ) -> FitResult:
-    """`hsnoise.fit`, telling of the frames that are read and of the time that the fit takes."""
+    """`hsnoise.fit` with progress: the frames read, and the time of the fit."""
     frames = sum(stack.n_frames)
     reading = Event("Reading frames")
 
@@ -114,7 +114,7 @@ def fit_with_progress(
 
 
 class _Line(ProgressColumn):
-    """The line of an account."""
+    """The progress line of an account."""
 
     def __init__(self, account: Account, columns: int):
         super().__init__()
@@ -126,7 +126,7 @@ class _Line(ProgressColumn):
 
 @contextmanager
 def _repeated(say: Callable[[], None]) -> Iterator[None]:
-    """Call `say` every half minute, however long what is within takes."""
+    """Call `say` every half minute inside this context."""
     ended = threading.Event()
 
     def repeat() -> None:

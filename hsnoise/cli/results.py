@@ -1,4 +1,4 @@
-"""What a fit and a story leave in a folder: model.json, table.csv, story.txt and figures."""
+"""Output files of a fit or a story: model.json, table.csv, story.txt and figures."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def improve_with_progress(
     page: Path | None = None,
     **limits: Any,
 ) -> Story:
-    """The loop; each model that it keeps is written to `out`, and the story so far to `page`, if there is to be one."""
+    """The loop; writes each model that it keeps to `out`, and the story so far to `page` if given."""
 
     def kept(story: Story) -> None:
         keep(story, out, source)
@@ -54,7 +54,7 @@ def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
 
 
 def write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bool = True) -> list[str]:
-    """model.json, table.csv and, unless told otherwise, the figures; returns their names."""
+    """Write model.json, table.csv and, by default, the figures; returns their names."""
     from hsnoise import plots  # matplotlib is slow to import
 
     provenance = {

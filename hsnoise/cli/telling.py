@@ -1,4 +1,4 @@
-"""Results in the terminal: the light and a sentence, what is doubtful, a table, and what else fits on the screen."""
+"""Results in the terminal: the light with a sentence, doubts, a table, and whatever else fits on the screen."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from hsnoise.fitting.result import TITLES, FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.structure import explained
 
-LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
+LINES, COLUMNS = 40, 100  # assumed without a terminal; LINES is also the maximum
 WORDS = ("added", "effect", "group of statistics", "worst group")  # headings of columns of text
 COLOURS = {Light.GREEN: "green", Light.AMBER: "yellow", Light.RED: "red"}
 
 
 @dataclass(frozen=True)
 class Page:
-    """What is told of a result, in this order.
+    """The printed parts of a result, in this order.
 
     Attributes:
         conclusion: the light and the sentence.
-        doubts: above the table.
+        doubts: sentences above the table.
         tables: tables, or lines of text.
-        notes: what should be known; as many as fit.
-        rest: what is told with --verbose only.
+        notes: further sentences, as many as fit.
+        rest: printed only with --verbose.
         colour: of the doubts.
     """
 
@@ -46,7 +46,7 @@ class Page:
 
 
 def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
-    """Print a page: what fits on one screen, how many lines were left out, and the `foot` in full; or all."""
+    """Print a page: what fits on one screen, the number of lines left out, and the whole `foot`; or everything."""
     console = screen()
     doubts = [Text(f"! {one}", page.colour) for one in page.doubts]
     head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
@@ -64,13 +64,13 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
 
 
 def screen() -> Console:
-    """The terminal; else a file in which sentences are not broken."""
+    """The terminal, or a file in which sentences are not wrapped."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=COLUMNS, height=LINES + 1)
 
 
 def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | None = None) -> Page:
-    """rest: what else --verbose tells."""
+    """rest: what else --verbose prints."""
     return Page(
         conclusion=fit.conclusion,
         doubts=fit.further_doubts,
@@ -102,7 +102,7 @@ def page_of_diagnosis(found: Diagnosis) -> Page:
 
 
 def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
-    """The steps, and the last fit."""
+    """A page of the steps and the last fit."""
     fit = page_of_fit(story.fit, truth=truth)
     return Page(
         conclusion=story.conclusion,
@@ -126,25 +126,25 @@ def page_of_inspection(found: Inspection) -> Page:
 
 
 def _light(conclusion: Conclusion, console: Console) -> Text:
-    """A coloured disc and the sentence; where there is no colour the light is a word."""
+    """A coloured disc and the sentence; without colour the light is a word."""
     if console.color_system is None or console.no_color or console.options.ascii_only:
         return Text(str(conclusion))
     return Text.assemble(("● ", f"bold {COLOURS[conclusion.light]}"), (conclusion.sentence, "bold"))
 
 
 def _plain(table: Table) -> Table:
-    """A result's table without its grid, numbers to the right."""
+    """A result's table without grid, numbers aligned right."""
     table.box = SIMPLE_HEAD
     for column in table.columns:
         column.justify = "left" if column.header in WORDS else "right"
     return table
 
 
-Printed = tuple[str, int]  # what is printed, and how many lines of the screen that takes
+Printed = tuple[str, int]  # printed text and its number of screen lines
 
 
 def _printed(text: Text, console: Console) -> Printed:
-    """A sentence. Where there is no terminal it stays one line, for those who search."""
+    """A sentence; outside a terminal it stays one line, for searching."""
     lines = _lines(text, console)
     if console.is_terminal:
         return "\n".join(lines), len(lines)
@@ -168,9 +168,9 @@ def _count(some: Iterable[Printed]) -> int:
 
 
 def _fitting(head: list[Printed], tables: list[Printed], notes: list[Printed], room: int, small: int) -> list[Printed]:
-    """Whole sentences and rows that fit: of the head, what half of the room holds; then the tables; then notes.
+    """Whole sentences and rows that fit: the head in at most half the room, then the tables, then notes.
 
-    small: room on a small screen. Notes wait there; a table is rather scrolled than cut.
+    small: room on a small screen, where notes are left out and tables scroll rather than being cut.
     """
     shown, used = head[:1], head[0][1]
     for part, most in ((head[1:], room // 2), (tables, room), (notes, small)):

@@ -12,12 +12,12 @@ from rich.table import Table
 from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
+from hsnoise.criticism import rules
 from hsnoise.criticism import sentences as _sentences
 from hsnoise.criticism.outcomes import Verdict
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
 
-MISFIT_LEFT = 3.5  # normal score of the worst group up to which nothing stands out
 WORST = 5
 
 
@@ -35,7 +35,7 @@ class Unexplained:
     @property
     def stands_out(self) -> bool:
         """Whether a group as a whole is off by more than chance; single statistics among hundreds may be."""
-        return self.misfit > MISFIT_LEFT
+        return self.misfit > rules.MISFIT_LEFT
 
 
 @dataclass(frozen=True)

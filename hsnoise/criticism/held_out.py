@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from hsnoise.criticism import sentences
-from hsnoise.criticism.reference import measure, reference
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
-DRAWS, SEEDS = 40, 5000  # of the likelihood; where its seeds begin, beyond those of fits
+DRAWS = 40  # of the likelihood
 
 
 def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
@@ -32,8 +35,9 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     return sentences.frames_apart(kept, held_out.n_frames)
 
 
-def log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
-    own = reference(model, frames, DRAWS, seed + SEEDS)
-    values = measure(frames, model).values
-    return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
+def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callable[[], None] = lambda: None) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats."""
+    simulator = Simulator(model, portion, key_for(seed, Purpose.HELD_OUT), tick)
+    own = simulator.reference(model, DRAWS)
+    z = own.z(simulator.measured.values)
+    return float(own.distribution.log_density(z) - np.log(own.deviation).sum())

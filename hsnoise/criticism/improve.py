@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hsnoise._core.arguments import callback, seed_of, whole_number
+from hsnoise._core.arguments import callback, seed_of
 from hsnoise._core.events import Event, counter
-from hsnoise.criticism import sentences
-from hsnoise.criticism.compare import DRAWS, Comparison, compare
-from hsnoise.criticism.diagnose import EVIDENCE, Diagnosis, check_candidates, diagnose, not_in
+from hsnoise.criticism import rules, sentences
+from hsnoise.criticism.acceptance import is_there, is_too_little, why_worse
+from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
+from hsnoise.criticism.compare import DRAWS, Comparison, compared
+from hsnoise.criticism.diagnose import diagnosed
+from hsnoise.criticism.finding import Diagnosis
 from hsnoise.criticism.held_out import log_likelihood, split_frames, split_in_words
+from hsnoise.criticism.limit import NO_LIMIT, Limit, TimeIsUp
 from hsnoise.criticism.outcomes import (
     Ended,
     Ending,
@@ -28,28 +31,20 @@ from hsnoise.criticism.outcomes import (
     side_of,
 )
 from hsnoise.criticism.ranking import Candidate
-from hsnoise.criticism.story import CHANCE_ERROR, Step, Story
+from hsnoise.criticism.story import Step, Story
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import fit, rechecked
 from hsnoise.fitting.result import FitResult, Method, number
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
-from hsnoise.likelihood.physics import WITH_LIKELIHOOD
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, darks_of
+from hsnoise.simulation.draws import check_fits
+from hsnoise.simulation.portion import Portion
 
 log = logging.getLogger(__name__)
 
-MOST_STEPS = 8
 MOST_TRIED = 4  # effects, where none explains all
-THERE_SIGMA = 2.0  # standard errors from 0, at least, of an effect that is added
-LATE_EVIDENCE = 12.0  # nats, of an effect beside others: banding had 7 in a capture without any, its frequency chosen
-NEEDED = 0.1  # share of the misfit of some group, at least, that comes back without an effect
-WORSE = -2.0  # nats of held-out likelihood from which a step is taken back
-CLEARLY_LESS = 0.95  # of the misfit of all groups together, where that of the worst one grows
-CHANGE_OF_OTHERS = 1.25  # factor by which the worst group may grow where all groups together fit better
-MOVED_SIGMA = 2.0
 
 
 def improve(
@@ -73,7 +68,7 @@ def improve(
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
             FrameStack's keywords.
         model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
-        candidates: effects of your own that may be added, too.
+        candidates: effects of your own that may be added, too, classes or instances as `diagnose` takes them.
         max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
             fit is finished in any case); None: as long as it takes.
         max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
@@ -113,10 +108,13 @@ def improved(
     """`improve`, telling what is being done as events instead of sentences."""
     keep, seed = callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
-    fitted, held_out = split_frames(darks_of(stack), stack)
-    _check_start(model, candidates, fitted)
-    limit = _Limit.of(max_minutes, max_steps)
-    work, split = _Work(fitted, held_out, seed, tell, limit), split_in_words(fitted, held_out)
+    darks = Portion.of(stack).darks.frames
+    fitted, held_out = split_frames(darks, stack)
+    portion = Portion.of(fitted)
+    _check_start(model, candidates, portion, seed)
+    limit = Limit.of(max_minutes, max_steps)
+    unseen = None if held_out is None else Portion.of(held_out)
+    work, split = _Work(fitted, portion, unseen, seed, tell, limit), split_in_words(fitted, held_out)
     work.say(Event("Fitting the first model"))
     steps = replace(work, limit=NO_LIMIT).begun(fit(fitted, model=model))
     measured = len(steps)
@@ -125,7 +123,7 @@ def improved(
         own = [c for c in candidates if c.name not in steps[-1].fit.params]
         try:
             ending = work.turn(steps, own)
-        except _TimeIsUp:
+        except TimeIsUp:
             continue
         if ending is not None:
             break
@@ -134,70 +132,38 @@ def improved(
     return story
 
 
-class _TimeIsUp(Exception):
-    """The minutes of a limit are over, in the middle of a step."""
-
-
-@dataclass(frozen=True)
-class _Limit:
-    """When the loop ends whatever is left: the time, s, and the number of additions."""
-
-    began_s: float
-    minutes: float
-    steps: int
-
-    @staticmethod
-    def of(max_minutes: float | None, max_steps: int | None) -> _Limit:
-        """Raises ValueError for limits that are none."""
-        minutes = np.inf if max_minutes is None else float(max_minutes)
-        if not minutes > 0:
-            raise ValueError(f"max_minutes: expected minutes above 0, got {max_minutes}")
-        steps = MOST_STEPS if max_steps is None else whole_number("max_steps", max_steps, 0)
-        return _Limit(time.monotonic(), minutes, steps)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the minutes have passed."""
-        return time.monotonic() - self.began_s > 60 * self.minutes
-
-    def reached(self, additions: int) -> Ending | None:
-        """How the story ends where a limit is reached; None if none is."""
-        if additions >= self.steps:
-            return Ending(Ended.STEPS, additions)
-        return Ending(Ended.MINUTES, self.minutes) if self.is_over else None
-
-
-NO_LIMIT = _Limit(0.0, np.inf, MOST_STEPS)
-
-
 @dataclass(frozen=True)
 class _Work:
-    """What every step is made of: frames to fit, frames held out, the seed, whom to tell, and when to end."""
+    """What every step is made of.
+
+    fitted: frames to fit, and their portion that is drawn; held_out: frames that no fit sees; tell: is told of events.
+    """
 
     fitted: FrameStack
-    held_out: FrameStack | None
+    portion: Portion
+    held_out: Portion | None
     seed: int
     tell: Callable[[Event], Any]
-    limit: _Limit = NO_LIMIT
+    limit: Limit = NO_LIMIT
 
     def say(self, event: Event) -> None:
         """Tell of a stage, and log it."""
         log.info("%s", event)
         self.tell(event)
 
-    def turn(self, steps: list[Step], own: Sequence[AbstractEffect]) -> Ending | None:
+    def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
         """Diagnose the last step, and append one more; if there is none, how the story ends.
 
-        Raises _TimeIsUp at the first draw after the limit: `steps` are as they were then, but for a diagnosis.
+        Raises TimeIsUp at the first draw after the limit: `steps` are as they were then, but for a diagnosis.
         """
         last = steps[-1]
         tick = self.counter(_stage("looking for what is missing", steps))
-        found = diagnose(last.fit, self.fitted, candidates=own, seed=self.seed + 1000, progress=tick)
+        found = diagnosed(last.fit, self.portion, tuple(own), seed=self.seed, tick=tick)
         steps[-1] = last = replace(last, diagnosis=found)
         nearest = _nearest(found)
         if not nearest:
             return _ending(found, last.comparison)
-        if _is_too_little(nearest, steps):
+        if is_too_little(nearest, steps):
             return Ending(Ended.FINISHED, following=(nearest[0].name, nearest[0].score))
         step, refused = self.first_that_holds(nearest, steps)
         if step is None:
@@ -206,12 +172,12 @@ class _Work:
         return None
 
     def counter(self, of: Event, total: int | None = None) -> Callable[[], None]:
-        """Says the number of each draw, and raises _TimeIsUp at the first one after the limit."""
+        """Says the number of each draw, and raises TimeIsUp at the first one after the limit."""
         count = counter(self.tell, of, total)
 
         def tick() -> None:
             if self.limit.is_over:
-                raise _TimeIsUp
+                raise TimeIsUp
             count()
 
         return tick
@@ -219,7 +185,7 @@ class _Work:
     def step(self, result: FitResult, added: str | None, steps: Sequence[Step]) -> Step:
         """The step after `steps`."""
         tick = self.counter(_stage("comparing with the model's samples", steps), DRAWS)
-        comparison = compare(result.params, self.fitted, seed=self.seed, progress=tick)
+        comparison = compared(result.params, self.portion, seed=self.seed, tick=tick)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
@@ -248,17 +214,19 @@ class _Work:
 
     def refusal(self, effect: AbstractEffect, step: Step, before: Step) -> Refusal | None:
         """Why the step with the effect is not kept; None if it is."""
-        worse = _why_worse(step, before)
+        worse = why_worse(step, before)
         if worse is not None:
             return worse
-        if not _is_there(effect, step.fit):
+        if not is_there(effect, step.fit):
             return Refusal(Refused.ZERO)
         return None if self.needs(effect.name, step) else Refusal(Refused.NO_CHANGE)
 
     def needs(self, name: str, step: Step) -> bool:
         """Whether some group fits worse without the effect: if not, what helped was that the others were refitted."""
-        without = compare(step.fit.params.remove(name), self.fitted, seed=self.seed).groups
-        return any(without[g] - misfit > NEEDED * max(misfit, 1.0) for g, misfit in step.comparison.groups.items())
+        without = compared(step.fit.params.remove(name), self.portion, seed=self.seed).groups
+        return any(
+            without[g] - misfit > rules.NEEDED * max(misfit, 1.0) for g, misfit in step.comparison.groups.items()
+        )
 
     def with_one_more(self, steps: list[Step], candidate: Candidate) -> Step | None:
         """The model with the candidate, on the side of the gain where it fits better; None if it cannot be fitted.
@@ -271,14 +239,14 @@ class _Work:
             stage = _stage(f"adding {effect.name}" if is_first else "the same on the other side of the gain", steps)
             self.say(stage)
             try:
-                fits.append(_fit_with(effect, steps, self.fitted, self.counter(stage)))
+                fits.append(_fit_with(effect, steps, self.fitted, self.portion, self.counter(stage)))
             except (RuntimeError, ValueError) as error:
                 self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
         if not fits:
             return None
         if len(fits) == 1:
             return self.step(fits[0], candidate.name, steps)
-        values = [log_likelihood(one.params, self.fitted, self.seed) for one in fits]
+        values = [log_likelihood(one.params, self.portion, self.seed) for one in fits]
         step = self.step(fits[int(np.argmax(values))], candidate.name, steps)
         return replace(step, ahead=abs(values[0] - values[1]))
 
@@ -289,52 +257,15 @@ def _stage(what: str, steps: Sequence[Step]) -> Event:
     return Event(f"Step {len(steps)}: {what}", errors)
 
 
-def _check_start(model: NoiseModel | None, candidates: tuple[AbstractEffect, ...], stack: FrameStack) -> None:
+def _check_start(model: NoiseModel | None, candidates: tuple[Suspect, ...], portion: Portion, seed: int) -> None:
     """Raise ValueError or TypeError for a model or candidates that cannot be drawn."""
     if not candidates:
         return
+    stack = portion.frames
     typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
     base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
     check_fits(base, stack, "model")
-    for effect in not_in(base, candidates):
-        check_effects(base.add(effect), stack)
-
-
-def _why_worse(step: Step, before: Step) -> Refusal | None:
-    """In which way statistics, or frames that no fit has seen, fit worse with what was added; None if they do not."""
-    # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
-    unseen = not (np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params))
-    after, until_now = step.comparison, before.comparison
-    errors = until_now.error, after.error
-    if not step.fit.converged and after.error * CHANGE_OF_OTHERS > until_now.error > CHANCE_ERROR:
-        return Refusal(Refused.NOT_CONVERGED, *errors)
-    allowed = WORSE
-    if after.error > until_now.error:
-        # The worst group may be that of another effect, which is still missing and does not stand quite still.
-        less = sum(after.groups.values()) < CLEARLY_LESS * sum(until_now.groups.values())
-        if not less or after.error > CHANGE_OF_OTHERS * until_now.error:
-            return Refusal(Refused.STATISTICS_WORSE, *errors)
-        allowed = 0.0
-    if unseen and step.held_out - before.held_out <= allowed:
-        return Refusal(Refused.HELD_OUT_WORSE, before.held_out, step.held_out)
-    return None
-
-
-def _is_there(effect: AbstractEffect, result: FitResult) -> bool:
-    """Whether some size of the effect is beyond chance in a fit with it.
-
-    Sizes may be 0 and have no upper bound, unlike places and shares; of an effect without any, numbers of either sign
-    count, or shares.
-    """
-    found = effect.parameters(result.params.channels)
-    kinds = (
-        [p.name for p in found if p.spec.low == 0 and p.spec.high is None],
-        [p.name for p in found if p.spec.low is None],
-        [p.name for p in found if p.spec.low == 0],
-    )
-    sizes = next((names for names in kinds if names), [])
-    rows = [result.table[name] for name in sizes if name in result.names]
-    return not rows or any(abs(value) > THERE_SIGMA * error for value, error, _ in rows)
+    check_makers(not_in(base, candidates), base, stack, facts_of(base, portion, seed))
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
@@ -345,7 +276,7 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
     if found.verdict == Verdict.NOTHING_MISSING:
         return ()
     names = [one.name for one in found.nearest]
-    others = [one for one in found.ranking if one.score > EVIDENCE and one.name not in names]
+    others = [one for one in found.ranking if one.score > rules.evidence(len(found.ranking)) and one.name not in names]
     return (*found.nearest, *others)[:MOST_TRIED]
 
 
@@ -356,32 +287,29 @@ def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
     return effect, *(on_side(effect, side) for side in Side if side != side_of(effect))
 
 
-def _is_too_little(nearest: tuple[Candidate, ...], steps: list[Step]) -> bool:
-    """Whether a further effect is too weak, beside those that were chosen from the same frames, where all fits."""
-    return len(steps) > 1 and steps[-1].comparison.error <= CHANCE_ERROR and nearest[0].score < LATE_EVIDENCE
-
-
-def _fit_with(effect: AbstractEffect, steps: list[Step], fitted: FrameStack, tick: Callable[[], None]) -> FitResult:
+def _fit_with(
+    effect: AbstractEffect, steps: list[Step], fitted: FrameStack, portion: Portion, tick: Callable[[], None]
+) -> FitResult:
     """A fit of the last model and one effect more; it goes on from the last fit by likelihood if that holds."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != Method.SYNTHETIC), None)
-    if base is None or any(name in WITH_LIKELIHOOD and name not in base.params for name in model.names):
+    if base is None or any(one.in_likelihood and one.name not in base.params for one in model):
         return fit(fitted, model=model)
-    return fit_synthetic(base, fitted, model, progress=tick)
+    return fit_synthetic(base, portion, model, tick=tick)
 
 
 def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
     moved = []
     for name in before.names:
         (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
-        if abs(new - old) > MOVED_SIGMA * max(error, new_error) > 0:
+        if abs(new - old) > rules.MOVED_SIGMA * max(error, new_error) > 0:
             moved.append(sentences.moved(name, (old, error), (new, new_error), unit))
     return tuple(moved)
 
 
 def _ending(found: Diagnosis, comparison: Comparison, refused: Mapping[str, Refusal] | None = None) -> Ending:
     """How the story ends where no step follows; refused: what was tried for one, None if nothing was."""
-    as_chance = comparison.error <= CHANCE_ERROR
+    as_chance = comparison.fits
     if refused is not None and as_chance:
         why = Ended.AS_CHANCE
     elif found.verdict == Verdict.NOTHING_MISSING:

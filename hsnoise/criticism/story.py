@@ -14,16 +14,13 @@ from rich.table import Table
 from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
-from hsnoise.criticism import sentences
-from hsnoise.criticism.compare import CLOSE, FITS, Comparison, nearer
+from hsnoise.criticism import rules, sentences
+from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
 from hsnoise.criticism.outcomes import Ended, Ending, Verdict
 from hsnoise.fit import without_likelihood
 from hsnoise.fitting.result import FitResult, number
 from hsnoise.model import NoiseModel
-
-CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
-SIDES_APART = 6.0  # nats from which frames tell the side of the gain that an effect is on
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Step:
         if self.added is None:
             return ()
         effect = self.fit.params[self.added]
-        return sentences.sizes(self.fit.rows_of(self.added), effect, self.ahead < SIDES_APART)
+        return sentences.sizes(self.fit.rows_of(self.added), effect, self.ahead < rules.SIDES_APART)
 
 
 @dataclass(frozen=True)
@@ -94,10 +91,10 @@ class Story:
     def conclusion(self) -> Conclusion:
         """Whether the last model may be used, and what became of the error."""
         error, last = self.errors[-1], self.fit.conclusion
-        if last.light == Light.RED or error >= CLOSE:
+        if last.light == Light.RED or error >= rules.CLOSE:
             light = Light.RED
         else:
-            light = last.light if self.finished and error < FITS else Light.AMBER
+            light = last.light if self.finished and error < rules.FITS else Light.AMBER
         doubt = "" if last.light == Light.GREEN else last.sentence
         found = self.steps[-1].diagnosis
         ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
@@ -199,5 +196,5 @@ def together(before: Step, after: Step) -> str:
 def _because(before: Step, after: Step) -> str:
     found, ranking = before.diagnosis, () if before.diagnosis is None else before.diagnosis.ranking
     score = next((one.score for one in ranking if one.name == after.added), 0.0)
-    is_nearest = found is not None and found.verdict == Verdict.UNEXPLAINED and after.comparison.error > CHANCE_ERROR
+    is_nearest = found is not None and found.verdict == Verdict.UNEXPLAINED and not after.comparison.fits
     return sentences.because(nearer(before.comparison, after.comparison), score, is_nearest)

@@ -20,7 +20,8 @@ from hsnoise._core.data_frames import table_to_pandas
 from hsnoise._core.types import unit_in_words
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood import rows
-from hsnoise.likelihood.physics import Physics, binning, dark_laws, log_probability
+from hsnoise.likelihood.darks import binning, dark_laws, likelihood_part, log_probability, row_sigma
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary, without_counts
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
@@ -83,7 +84,7 @@ class FitResult:
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
         summary: the row histograms and photon transfer that were fitted.
-        physics: the same parameters as `hsnoise.physics` takes them.
+        outliers: fraction of the pixels of each dark exposure that was set apart, as it follows no model; or None.
         doubts: sentences on what disagrees, and on what is withheld; printed above the table.
         grave: whether one of them says that a parameter may be wrong; others tell what was set apart.
         withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
@@ -103,7 +104,7 @@ class FitResult:
     log_likelihood: float
     notes: tuple[str, ...]
     summary: Summary
-    physics: Physics
+    outliers: np.ndarray | None = None
     doubts: tuple[str, ...] = ()
     grave: bool = False
     withheld: tuple[str, ...] = ()
@@ -140,7 +141,7 @@ class FitResult:
     @property
     def has_gain(self) -> bool:
         """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
-        return not set(self.rows_of("gain")) & set(self.withheld)
+        return not any(number.name in self.withheld for number in numbers_of(self.params, ["gain"]))
 
     @cached_property
     def pixels(self) -> PixelMaps:
@@ -150,7 +151,7 @@ class FitResult:
         """
         if self.stack is None:
             raise ValueError("pixels: this fit has no frames, it was made from a Summary or from flats")
-        return pixel_maps(self.stack, np.asarray(self.physics.gain) if self.has_gain else None)
+        return pixel_maps(self.stack, np.asarray(self.params["gain"].value) if self.has_gain else None)
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
@@ -210,10 +211,9 @@ class FitResult:
     def expected_laws(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each channel [exposure, bin]: probability of a bin over all row gains, and its deviation between rows."""
         with jax.enable_x64(True):
-            physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self.physics)
-            light = without_counts(self.summary)
+            sensor, light = (likelihood_part(self.params), self.outliers), without_counts(self.summary)
             found = (
-                _expected(physics, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
+                _expected(sensor, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
             )
             return [jax.tree.map(np.asarray, laws) for laws in found]
 
@@ -268,24 +268,28 @@ class FitResult:
 
 
 @jax.jit
-def _expected(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
-    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin]."""
+def _expected(sensor, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
+    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin].
+
+    sensor: a model and the shares of outliers beside it.
+    """
+    model, outliers = sensor
     beta, weight = jnp.ones(1), jnp.ones(1)
-    if physics.row_sigma is not None:
-        sigma = jnp.maximum(physics.row_sigma[c], 1e-6)
+    if "row_gain" in model:
+        sigma = row_sigma(model)[c]
         nodes = rows.make_nodes(jnp.zeros(1), (1 + rows.PRIOR_REACH * sigma)[None], 0.1, sigma, 256)
         beta, density = nodes.beta[0], jax.scipy.stats.norm.pdf(nodes.beta[0], 1.0, sigma)
         weight = jnp.exp(nodes.log_weight[0]) * density
         weight = weight.at[0].add(jax.scipy.stats.norm.cdf((beta[0] - 1) / sigma))
 
     def exposure(at):
-        law = jnp.exp(log_probability(physics, at, beta))
+        law = jnp.exp(log_probability(model, outliers, at, beta))
         share = weight / weight.sum()
         mixed = share @ law
         return mixed / mixed.sum(), jnp.sqrt(share @ (law - mixed[None, :]) ** 2)
 
     exposures = len(summary.exposure_s)
-    laws = dark_laws(physics, summary.exposure_s)
+    laws = dark_laws(model, summary.exposure_s)
     at = binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures), edges_dn, outlier_law)
     return jax.lax.map(exposure, at)
 

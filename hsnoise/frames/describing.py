@@ -1,4 +1,4 @@
-"""A `FrameStack` in words: what `print`, notebooks and the command line show of it."""
+"""Descriptions of a `FrameStack` for `print`, notebooks and the command line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Group = tuple[str, float, int, float, float, float]
 
 
 def groups_of(stack: Any) -> list[Group]:
-    """Of each exposure group of a `FrameStack` what COLUMNS say; NaN where it is unknown."""
+    """The values of COLUMNS for each exposure group of a `FrameStack`; NaN where unknown."""
     known = [stack.photons_e, stack.temperature_c, stack.overscan_dn]
     columns = [np.full(stack.n_exposures, np.nan) if values is None else values for values in known]
     numbers = np.stack(columns, 1).tolist()
@@ -25,7 +25,7 @@ def groups_of(stack: Any) -> list[Group]:
 
 
 def described(stack: Any) -> str:
-    """Size, levels and groups of a `FrameStack`, a line each, and what was assumed when it was loaded."""
+    """Size, levels and groups of a `FrameStack`, one per row, and what was assumed when it was loaded."""
     lines = [f"FrameStack: {size_of(stack)}", f"  {levels_of(stack)}", *map(_line, groups_of(stack))]
     if stack.elsewhere is not None:
         lines.append(f"  {_elsewhere(stack)}")
@@ -72,7 +72,7 @@ def _line(group: Group) -> str:
 
 
 def _table(stack: Any) -> str:
-    """The groups as HTML, without columns of which nothing is known."""
+    """The groups as HTML, without columns that are unknown throughout."""
     groups = groups_of(stack)
     shown = [i for i in range(len(COLUMNS)) if i < 3 or any(np.isfinite(group[i]) for group in groups)]
     digits = ("", ".6g", "", "g", ".1f", ".1f")

@@ -1,4 +1,4 @@
-"""All figures that a fit can have."""
+"""All figures of a fit."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from hsnoise.plots._sampled import dark_current
 
 
 def of_fit(fit) -> dict[str, Figure]:
-    """The figures of a fit by name: those that its frames and its method allow.
+    """The figures of a fit by name, as far as its frames and method allow.
 
-    A fit of several effects by simulated statistics has none: they would lack the added effects.
+    A fit of several effects by simulated statistics has none: the figures would lack the added effects.
 
     Args:
         fit: result of `hsnoise.fit`.

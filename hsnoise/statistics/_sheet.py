@@ -1,4 +1,4 @@
-"""What one exposure gives, and how the exposures of one half are averaged."""
+"""The statistics of one exposure, and their averages over exposures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 ABS_VARIANCE = 1 - 2 / np.pi  # of |x| of a standard normal x
-TINY_DN2 = 1e-4  # far below the variance of rounding: keeps logarithms of empty variances finite
+TINY_DN2 = 1e-4  # far below the variance of rounding; keeps the logarithm of a zero variance finite
 LARGEST_CORRELATION = 0.9999
 
 
@@ -19,7 +19,7 @@ def log_ratio(above: np.ndarray, below: np.ndarray | float) -> np.ndarray:
 
 
 def fisher(correlation: np.ndarray) -> np.ndarray:
-    """artanh of correlations: standard error 1/sqrt(n) whatever their size."""
+    """artanh of correlations: its standard error is 1/sqrt(n) for any correlation."""
     return np.arctanh(np.clip(correlation, -LARGEST_CORRELATION, LARGEST_CORRELATION))
 
 
@@ -51,7 +51,7 @@ class Sheet:
     entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
 
     def add(self, group: str, what: str, values: np.ndarray | float, error: float, *, of_map: bool = False) -> None:
-        """The mean of `values` over whatever axes they have; `error` is that of the mean."""
+        """The mean of `values` over all axes; `error` is the standard error of that mean."""
         values = np.asarray(values, np.float64)
         self.entries[group, what] = Entry(float(values.sum() / values.size), float(error), of_map=of_map)
 
@@ -59,7 +59,7 @@ class Sheet:
         self.entries[group, what] = Entry(float(number), 0.5, is_count=True, of_map=of_map)
 
     def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
-        """One statistic a colour from values [plane]; `error` is that of one plane."""
+        """One statistic per colour from values [plane]; `error` is that of one plane."""
         for colour in dict.fromkeys(self.letters):
             of = [i for i, letter in enumerate(self.letters) if letter == colour]
             name = what if colour == "mono" else f"{what}, {colour}"
@@ -69,7 +69,7 @@ class Sheet:
 def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
     """The statistics of the exposures of one half: means, and square roots of summed numbers.
 
-    An exposure of few frames has fewer statistics than others: the mean is over those that have one.
+    Exposures with few frames lack some statistics: each mean is over the exposures that have it.
     """
     keys = dict.fromkeys(key for sheet in sheets for key in sheet.entries)
     out = {}

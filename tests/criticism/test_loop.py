@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 
 import hsnoise
 from hsnoise import effects as fx
@@ -18,12 +19,12 @@ from hsnoise.cli.demo import simulated
 from hsnoise.criticism import candidates as library
 from hsnoise.criticism import sentences
 from hsnoise.criticism.compare import Comparison, nearer
-from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
 from hsnoise.criticism.improve import _ending, _is_there, _is_too_little, _why_worse, _Work
 from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused
 from hsnoise.criticism.story import Step, Story, together
-from hsnoise.simulation.draws import darks_of, draw_capture
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
@@ -194,15 +195,15 @@ def test_a_large_capture_keeps_its_place_on_the_sensor():
     comparison = hsnoise.compare(truth, stack, draws=8)
     assert comparison.error < 3
     assert any("columns" in sentence for sentence in comparison.skipped)
-    assert darks_of(darks_of(stack)).window == darks_of(stack).window
+    assert Portion.of(darks_of(stack)).darks.frames.window == Portion.of(stack).darks.frames.window
 
 
 def test_a_capture_of_one_exposure_is_offered_no_clamp():
-    darks = darks_of(empty_stack(exposure_s=(0.1,)))
-    assert "black_clamp" not in library.built_in(
-        hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0), darks
-    )
-    assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
+    darks = Portion.of(empty_stack(exposure_s=(0.1,))).darks.frames
+    dim = hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0)
+    assert "black_clamp" not in library.built_in(library.facts_of(dim, darks))
+    bright = MODEL.with_value("dark_current", "rate", 500.0)
+    assert "black_clamp" in library.built_in(library.facts_of(bright, Portion.of(empty_stack()).darks.frames))
 
 
 @pytest.mark.slow
@@ -253,7 +254,7 @@ def test_shrunk_law_is_that_of_its_draws():
 
 def test_large_captures_are_cut_but_keep_their_rows():
     big = empty_stack(frames=3, shape=(1200, 1600), exposure_s=(0.1,))
-    cut = darks_of(big)
+    cut = Portion.of(big).darks.frames
     assert cut.shape[0] == 1200 and cut.shape[1] < 1600 and cut.shape[1] % 2 == 0
 
 
@@ -387,7 +388,7 @@ def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_ou
     if flats:  # between the darks
         counts, kinds = [counts[0], lit, counts[1]], ["dark", "flat", "dark"]
     stack = hsnoise.FrameStack(counts, np.arange(len(counts)), kind=kinds, shutter="global")
-    kept, unseen = split_frames(darks_of(stack), stack)
+    kept, unseen = split_frames(Portion.of(stack).darks.frames, stack)
     numbers = (fitted[0], 3, fitted[1]) if flats else fitted
     assert kept.n_frames == numbers and kept.kind == stack.kind
     assert (unseen is None) if held_out is None else (unseen.n_frames == held_out)

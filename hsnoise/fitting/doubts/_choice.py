@@ -11,6 +11,7 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import result_of
 from hsnoise.fitting.result import FitResult, Method, Status
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
@@ -45,7 +46,7 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
     if result.method == Method.LINE:
         failed = result.status == Status.LINE_INSTEAD
         return replace(other(), status=Status.TRANSFER_INSTEAD, detail=result.detail) if failed else result
-    gain, error = np.asarray(result.physics.gain), _gain_errors(result)
+    gain, error = np.asarray(result.params["gain"].value), _gain_errors(result)
     off = np.abs(gain - pixel.estimate[: len(gain)])
     apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)
     if not apart.any():
@@ -54,7 +55,8 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
 
 
 def _gain_errors(result: FitResult) -> np.ndarray:
-    return np.array([error for _, error, _ in result.rows_of("gain").values()])
+    table = result.table
+    return np.array([table[number.name][1] for number in numbers_of(result.params, ["gain"])])
 
 
 def _errors(pixel: PixelFit) -> np.ndarray:
