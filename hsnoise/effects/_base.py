@@ -5,7 +5,7 @@ An effect of one's own is a class of about 20 lines in one's own file:
     class RowOffset(AbstractEffect):
         name = "row_offset"
         stage = Stage.READ
-        sigma: Scalar = param("e-", low=0, doc="standard deviation over rows and frames")
+        sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over rows and frames")
 
         def sample(self, signal, capture, *, key):
             frames, rows, _ = signal.shape
