@@ -125,6 +125,11 @@ class FitResult:
             rows_[name] = (value, error, unit)
         return rows_
 
+    def rows_of(self, effect: str) -> list[tuple[float, float, str]]:
+        """The rows of `table` of one effect: a value, standard error and unit for each of its numbers."""
+        table = self.table
+        return [table[number.name] for number in numbers_of(self.params, [effect])]
+
     @property
     def converged(self) -> bool:
         """Whether the fit ended where it should."""

@@ -10,7 +10,6 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import result_of
 from hsnoise.fitting.result import FitResult
-from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
 
@@ -55,8 +54,7 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
 
 
 def _gain_errors(result: FitResult) -> np.ndarray:
-    table = result.table
-    return np.array([table[number.name][1] for number in numbers_of(result.params, ["gain"])])
+    return np.array([error for _, error, _ in result.rows_of("gain")])
 
 
 def _errors(pixel: PixelFit) -> np.ndarray:

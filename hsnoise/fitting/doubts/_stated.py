@@ -32,7 +32,7 @@ def header_gain(result: FitResult) -> Iterator[str]:
     """A gain that the header states, against the fitted one; where it may be a nominal one, the frames are believed."""
     if result.stack is None or not result.has_gain:
         return
-    rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
+    rows = result.rows_of("gain")
     value, error = (float(np.mean([row[i] for row in rows])) for i in (0, 1))
     yield from stated_gain_note(result.stack.stated_gain, value, error)
 
