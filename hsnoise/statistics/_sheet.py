@@ -1,10 +1,11 @@
-"""What one exposure gives, and how the exposures of one half are averaged."""
+"""What exposures give, and how those of one half are averaged."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,56 +26,81 @@ def fisher(correlation: np.ndarray) -> np.ndarray:
 
 def correlation(a: np.ndarray, b: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     """artanh of the uncentred correlation of two arrays over `axes`; 0 where one of them is all zero."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     power = (a * a).sum(axes) * (b * b).sum(axes)
     return fisher((a * b).sum(axes) / np.sqrt(np.maximum(power, 1e-60)))
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A statistic of one exposure: a value with its standard error, or a number of rare pixels."""
+def correlations(x: np.ndarray) -> np.ndarray:
+    """artanh of the uncentred correlations of the planes of x [exposure, plane, ...]: [exposure, plane, plane]."""
+    flat = x.reshape(*x.shape[:2], -1)
+    product = flat @ flat.transpose(0, 2, 1)
+    power = np.diagonal(product, axis1=1, axis2=2)
+    return fisher(product / np.sqrt(np.maximum(power[:, :, None] * power[:, None], 1e-60)))
+
+
+class Entry(NamedTuple):
+    """A statistic with its standard error."""
 
     value: float
     error: float
-    is_count: bool = False
 
 
-@dataclass
+@lru_cache
+def planes_by_colour(letters: tuple[str, ...]) -> tuple[tuple[str, list[int]], ...]:
+    """Of each colour, what follows the name of its statistics, and its planes."""
+    return tuple(
+        ("" if colour == "mono" else f", {colour}", [i for i, letter in enumerate(letters) if letter == colour])
+        for colour in dict.fromkeys(letters)
+    )
+
+
+@dataclass(eq=False)
 class Sheet:
-    """The statistics of one exposure by (group, what). `letters` [plane] is the colour of each plane."""
+    """The statistics of exposures with one number of frames. `letters` [plane] is the colour of each plane.
+
+    exposures: their numbers. values, errors: [exposure], by (group, what); counts: which are numbers of rare pixels.
+    """
 
     letters: tuple[str, ...]
-    entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
+    exposures: Sequence[int]
+    values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    errors: dict[tuple[str, str], np.ndarray | float] = field(default_factory=dict)
+    counts: set[tuple[str, str]] = field(default_factory=set)
 
-    def add(self, group: str, what: str, values: np.ndarray | float, error: float) -> None:
-        """The mean of `values` over whatever axes they have; `error` is that of the mean."""
-        values = np.asarray(values, np.float64)
-        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error))
+    def add(self, group: str, what: str, values: np.ndarray, error: np.ndarray | float) -> None:
+        """The mean of values [exposure, ...] over whatever further axes they have; `error` is that of the mean."""
+        n = len(self.exposures)
+        self.values[group, what] = values.reshape(n, -1).sum(1) / (values.size // n)
+        self.errors[group, what] = error
 
-    def add_count(self, group: str, what: str, number: float) -> None:
-        self.entries[group, what] = Entry(float(number), 0.5, is_count=True)
+    def add_count(self, group: str, what: str, numbers: np.ndarray) -> None:
+        self.add(group, what, numbers, 0.5)
+        self.counts.add((group, what))
 
-    def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
-        """One statistic a colour from values [plane]; `error` is that of one plane."""
-        for colour in dict.fromkeys(self.letters):
-            of = [i for i, letter in enumerate(self.letters) if letter == colour]
-            name = what if colour == "mono" else f"{what}, {colour}"
-            self.add(group, name, np.asarray(values)[of], error / np.sqrt(len(of)))
+    def add_colours(self, group: str, what: str, values: np.ndarray, error: np.ndarray | float) -> None:
+        """One statistic a colour from values [exposure, plane]; `error` is that of one plane."""
+        for colour, planes in planes_by_colour(self.letters):
+            self.add(group, f"{what}{colour}", values[:, planes], error / np.sqrt(len(planes)))
 
 
-def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
-    """The statistics of the exposures of one half: means, and square roots of summed numbers.
+def gather(sheets: Sequence[Sheet], half: str, chosen: Sequence[int]) -> dict[tuple[str, str], Entry]:
+    """The statistics of the `chosen` exposures: means, and square roots of summed numbers.
 
     An exposure of few frames has fewer statistics than others: the mean is over those that have one.
     """
-    keys = dict.fromkeys(key for sheet in sheets for key in sheet.entries)
-    out = {}
-    for group, what in keys:
-        found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
-        total = sum(entry.value for entry in found)
-        if found[0].is_count:
-            entry = Entry(math.sqrt(total), 0.5)
-        else:
-            entry = Entry(total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found))
-        out[group, f"{what}, {half}"] = entry
-    return out
+    sheet_of = {number: sheet for sheet in sheets for number in sheet.exposures}
+    keys = list(dict.fromkeys(key for number in chosen for key in sheet_of[number].values))
+    number, total, square = np.zeros((3, len(keys)))
+    for sheet in dict.fromkeys(sheet_of[number] for number in chosen):
+        of = [i for i, exposure in enumerate(sheet.exposures) if exposure in chosen]
+        where = [i for i, key in enumerate(keys) if key in sheet.values]
+        values = np.array([sheet.values[keys[i]] for i in where])[:, of]
+        errors = np.array([np.broadcast_to(sheet.errors[keys[i]], len(sheet.exposures)) for i in where])[:, of]
+        number[where] += len(of)
+        total[where] += values.sum(1)
+        square[where] += (errors**2).sum(1)
+    rare = np.array([any(key in sheet.counts for sheet in sheets) for key in keys])
+    value = np.where(rare, np.sqrt(np.maximum(total, 0)), total / number)
+    error = np.where(rare, 0.5, np.sqrt(square) / number)
+    entries = map(Entry, value.tolist(), error.tolist())
+    return {(group, f"{what}, {half}"): entry for (group, what), entry in zip(keys, entries, strict=True)}

@@ -14,8 +14,10 @@ import numpy as np
 
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
-from hsnoise.statistics._anova import Exposure, Layout, check_size, layout_of, read_exposure
+from hsnoise.statistics._anova import Layout, analyse, check_size, layout_of, read_counts, signal_of
 from hsnoise.statistics._codes import code_step
+from hsnoise.statistics._exposures import VARIANCE_FRAMES, Exposure, exposure_of, stacked
+from hsnoise.statistics._histograms import histogram_shape
 from hsnoise.statistics._places import Places, places
 from hsnoise.statistics._sheet import TINY_DN2, Entry, Sheet, gather
 
@@ -36,6 +38,22 @@ class Structure:
     error: np.ndarray
     skipped: tuple[str, ...]
 
+
+BATCH_PIXELS = 1 << 20  # of the maps of exposures whose statistics are taken together
+STATISTICS = (
+    _pixels.levels,
+    _pixels.codes,
+    _lines.variances,
+    _lines.colours,
+    _lines.scales,
+    _lines.noise_of_rows,
+    _lines.spectra,
+    _pixels.lags,
+    _pixels.tails,
+    _pixels.frames_over_time,
+    _pixels.blocks,
+    _pixels.variance_over_time,
+)
 
 SHORT = "short exposures"
 WORDS = {
@@ -91,62 +109,81 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("short", "long") if n > 1 else ("even", "odd")
-    capture = _Capture([], [], [], [], [], np.zeros(1, np.uint16))
-    for number in range(n):
-        x = read_exposure(stack, layout, number, black_level_dn)
-        capture.add(x, layout, halves[number], stack.white_level, alone=n == 1)
+    capture = _Capture([], {}, {}, {}, {}, np.zeros(1, np.uint16))
+    for numbers in _batches(layout):
+        read = [_read(stack, layout, number, black_level_dn, alone=n == 1) for number in numbers]
+        capture.add(stacked(read), layout, numbers, halves)
+    spectra, profiles, views, levels = (
+        [of[i] for i in range(n)] for of in (capture.spectra, capture.profiles, capture.views, capture.levels)
+    )
     entries: dict[tuple[str, str], Entry] = {}
     for half in sorted(set(halves)):
         some = [i for i in range(n) if halves[i] == half]
-        entries |= gather([capture.sheets[i] for i in some], f"{names[half]} exposures" if n > 1 else "all frames")
+        entries |= gather(capture.sheets, f"{names[half]} exposures" if n > 1 else "all frames", some)
         if n > 1:
-            entries |= _peaks([capture.spectra[i] for i in some], f"{names[half]} exposures")
-    entries |= _peaks(capture.spectra, "all exposures" if n > 1 else "all frames")
-    entries |= _shares(capture.profiles)
-    if len(capture.views) > 1:
-        entries |= _views.persistence(capture.views, names)
+            entries |= _peaks([spectra[i] for i in some], f"{names[half]} exposures")
+    entries |= _peaks(spectra, "all exposures" if n > 1 else "all frames")
+    entries |= _shares(profiles)
+    seen = [view for of_exposure in views for view in of_exposure]
+    if len(seen) > 1:
+        entries |= _views.persistence(seen, names)
     if max(layout.frames) > 1:
-        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(capture.views), 0.15)
-    if max(layout.frames) > 2:
+        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(seen), 0.15)
+    if max(layout.frames) >= VARIANCE_FRAMES:
         entries |= _views.outlier_counts(capture.outliers)
-    return entries | _curvature(capture.exposures, layout)
+    return entries | _curvature(levels, layout)
+
+
+def _batches(layout: Layout) -> list[list[int]]:
+    """Numbers of the exposures whose statistics are taken together: of as many frames, and not too large."""
+    most = max(
+        1, BATCH_PIXELS // ((layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start))
+    )
+    out = []
+    for frames in dict.fromkeys(layout.frames):
+        some = [i for i, number in enumerate(layout.frames) if number == frames]
+        out += [some[start : start + most] for start in range(0, len(some), most)]
+    return out
+
+
+def _read(stack: FrameStack, layout: Layout, number: int, black_level_dn: np.ndarray, *, alone: bool) -> Exposure:
+    """One exposure, of which no frames are kept; alone: it is the only one."""
+    counts = read_counts(stack, layout, number)
+    codes = np.array([histogram_shape(plane, stack.white_level) for plane in counts])
+    signal = signal_of(counts, layout, black_level_dn)
+    del counts
+    return exposure_of(*analyse(signal), codes, halves=alone and layout.frames[number] > 1)
 
 
 @dataclass
 class _Capture:
-    """What is kept of the exposures read so far; never their frames."""
+    """What is kept of the exposures read so far, by their number; never their frames."""
 
     sheets: list[Sheet]
-    spectra: list[dict[str, np.ndarray]]
-    profiles: list[dict[str, np.ndarray]]
-    views: list[_views.View]
-    exposures: list[tuple[np.ndarray, np.ndarray]]
+    spectra: dict[int, dict[str, np.ndarray]]
+    profiles: dict[int, dict[str, np.ndarray]]
+    views: dict[int, list[_views.View]]
+    levels: dict[int, tuple[np.ndarray, np.ndarray]]
     outliers: np.ndarray
 
-    def add(self, x: Exposure, layout: Layout, half: int, white_level: float | None, *, alone: bool) -> None:
-        sheet = Sheet(layout.letters)
-        _pixels.levels(sheet, x, white_level)
-        _lines.variances(sheet, x)
-        _lines.colours(sheet, x)
-        _lines.scales(sheet, x)
-        _lines.noise_of_rows(sheet, x)
-        _lines.spectra(sheet, x)
-        _pixels.lags(sheet, x)
-        _pixels.tails(sheet, x)
-        _pixels.frames_over_time(sheet, x)
-        _pixels.blocks(sheet, x)
-        log_variance = None
-        if x.shape[1] >= _views.VARIANCE_FRAMES:
-            log_variance = _pixels.log_temporal_variance(x.residual)
-            _pixels.variance_over_time(sheet, x, log_variance)
-            self.outliers = self.outliers + _views.outliers_of(x)
+    def add(self, x: Exposure, layout: Layout, numbers: list[int], halves: list[int]) -> None:
+        sheet = Sheet(layout.letters, numbers)
+        for statistics in STATISTICS:
+            statistics(sheet, x)
         self.sheets.append(sheet)
-        self.spectra.append(_lines.periodograms(x))
-        self.profiles.append(_lines.static_profiles(x))
-        self.exposures.append((x.mean, x.variance))
-        self.views.extend(
-            _views.even_and_odd(x) if alone and x.shape[1] > 1 else [_views.view_of(x, half, log_variance)]
+        if x.shape[1] >= VARIANCE_FRAMES:
+            self.outliers = self.outliers + x.outliers.sum(0, dtype=np.uint16)
+        spectra, profiles = _lines.periodograms(x), _lines.static_profiles(x)
+        views = (
+            [_views.even_and_odd(x)]
+            if x.half_pixel.size
+            else [[view] for view in _views.views_of(x, [halves[i] for i in numbers])]
         )
+        for i, number in enumerate(numbers):
+            self.spectra[number] = {group: values[i] for group, values in spectra.items()}
+            self.profiles[number] = {group: values[i] for group, values in profiles.items()}
+            self.views[number] = views[i]
+            self.levels[number] = x.mean[i], x.variance[i]
 
 
 def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, str], Entry]:
@@ -186,9 +223,10 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     used = {"row": layout.rows, "column": layout.columns}
 
     def spectra(capture: FrameStack) -> dict[str, np.ndarray]:
-        read = (read_exposure(capture, layout, i, black_level_dn) for i in range(len(layout.frames)))
-        found = [_lines.periodograms(x) for x in read]
-        return {axis: np.stack([of[f"{axis} x frame"] for of in found]) for axis in used}
+        read = (read_counts(capture, layout, i) for i in range(len(layout.frames)))
+        lines = (analyse(signal_of(counts, layout, black_level_dn))[0] for counts in read)
+        found = [_lines.periodograms(stacked([x])) for x in lines]
+        return {axis: np.concatenate([of[f"{axis} x frame"] for of in found]) for axis in used}
 
     step = 1 if layout.cfa == "mono" else 2
     expected = [spectra(drawn) for drawn in draws]
@@ -212,12 +250,12 @@ def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -
     size = np.array([layout.frames[i] for i in (0, middle, -1)])
     pixels = (layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start)
     error = float(np.sqrt((len(layout.letters) / (size * pixels)).sum()))
-    sheet = Sheet(layout.letters)
+    sheet = Sheet(layout.letters, (middle,))
     bent = (mean1 - (1 - share) * mean0 - share * mean2) / np.sqrt(variance1 + TINY_DN2)
-    sheet.add_colours("level", "curvature of the mean over exposure", bent, error)
+    sheet.add_colours("level", "curvature of the mean over exposure", bent[None], error)
     bent = variance1 / ((1 - share) * variance0 + share * variance2 + TINY_DN2)
-    sheet.add_colours("noise", "curvature of the variance over exposure", bent, error * np.sqrt(2))
-    return sheet.entries
+    sheet.add_colours("noise", "curvature of the variance over exposure", bent[None], error * np.sqrt(2))
+    return {key: Entry(values.item(), float(sheet.errors[key])) for key, values in sheet.values.items()}
 
 
 def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure:
@@ -238,11 +276,11 @@ def _too_few(layout: Layout) -> tuple[str, ...]:
     out = []
     if frames < 2:
         out.append("A single frame does not tell static patterns from noise: what needs two frames is left out.")
-    elif frames < _views.VARIANCE_FRAMES:
+    elif frames < VARIANCE_FRAMES:
         out.append("Two frames do not give a variance over time for each pixel: what needs three frames is left out.")
     if 2 <= frames < 4:
         out.append("Flicker and drift are told apart from four frames on: their statistics are left out.")
-    if n == 1 and frames // 2 < _views.VARIANCE_FRAMES:
+    if n == 1 and frames // 2 < VARIANCE_FRAMES:
         out.append("Whether noisy pixels stay noisy needs two exposures or six frames: it is left out.")
     if n < 3:
         out.append("Whether mean and variance grow in proportion to exposure needs three exposures: it is left out.")
