@@ -1,7 +1,8 @@
-"""One exposure read into memory and split by an analysis of variance over frames, rows and columns."""
+"""Exposures read into memory and split by an analysis of variance over frames, rows and columns."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,10 +39,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class Lines:
-    """Analysis of variance of the counts above black [plane, frame, row, column] of one exposure, DN, but its pixels.
+    """Analysis of variance of the counts above black of exposures with one number of frames, DN, but its pixels.
 
-    mean [plane], frame [plane, frame], row_frame [plane, frame, row], column_frame [plane, frame, column],
-    row [plane, row] and column [plane, column]; of several exposures all have a leading axis.
+    mean [exposure, plane], frame [exposure, plane, frame], row_frame [exposure, plane, frame, row],
+    column_frame [exposure, plane, frame, column], row [exposure, plane, row], column [exposure, plane, column].
 
     With a single frame there is no difference between static and not: row_frame and column_frame hold what `row` and
     `column` hold.
@@ -90,50 +91,53 @@ def _central(shape: tuple[int, int]) -> tuple[slice, slice]:
     return slice(starts[0], starts[0] + sizes[0]), slice(starts[1], starts[1] + sizes[1])
 
 
-def read_counts(stack: FrameStack, layout: Layout, number: int) -> np.ndarray:
-    """Counts [plane, frame, row, column] of exposure `number` of the layout as they are stored, DN."""
+def read_counts(stack: FrameStack, layout: Layout, numbers: Sequence[int]) -> np.ndarray:
+    """Counts [exposure, plane, frame, row, column] of exposures of the layout with one number of frames, DN."""
     step = len(cfa_tile(layout.cfa))
+    rows, columns = ((used.stop - used.start) // step for used in (layout.rows, layout.columns))
+    frames = layout.frames[numbers[0]]
     counts = None
-    for f in range(layout.frames[number]):
-        frame = stack.frame(layout.exposures[number], f)[layout.rows, layout.columns]
-        rows, columns = frame.shape[0] // step, frame.shape[1] // step
-        if counts is None:
-            counts = np.empty((step, step, layout.frames[number], rows, columns), frame.dtype)
-        cells = frame[: rows * step, : columns * step].reshape(rows, step, columns, step)
-        counts[:, :, f] = cells.transpose(1, 3, 0, 2)
-    return counts.reshape(step**2, *counts.shape[2:])
+    for i, number in enumerate(numbers):
+        for f in range(frames):
+            frame = stack.frame(layout.exposures[number], f)[layout.rows, layout.columns]
+            if counts is None:
+                counts = np.empty((len(numbers), step, step, frames, rows, columns), frame.dtype)
+            cells = frame[: rows * step, : columns * step].reshape(rows, step, columns, step)
+            counts[i, :, :, f] = cells.transpose(1, 3, 0, 2)
+    return counts.reshape(len(numbers), step**2, frames, rows, columns)
 
 
 def signal_of(counts: np.ndarray, layout: Layout, black_level_dn: np.ndarray) -> np.ndarray:
-    """Counts above black [plane, frame, row, column], DN; black_level_dn [channel] or a scalar, DN."""
+    """Counts above black [exposure, plane, frame, row, column], DN; black_level_dn [channel] or a scalar, DN."""
     tile = cfa_tile(layout.cfa)
     black = np.broadcast_to(np.asarray(black_level_dn, np.float64), (len(channels_of(layout.cfa)),))[tile.ravel()]
     return np.subtract(counts, black.astype(np.float32)[:, None, None, None], dtype=np.float32)
 
 
 def analyse(signal: np.ndarray) -> tuple[Lines, np.ndarray, np.ndarray]:
-    """Lines, static map [plane, row, column] and residual of `signal` [plane, frame, row, column], DN.
+    """Lines, static map [exposure, plane, row, column] and residual of `signal`, DN, which is overwritten.
 
-    Together they add up to the signal, which is overwritten. With a single frame the residual holds the static map.
+    Together they add up to the signal [exposure, plane, frame, row, column]. With a single frame the residual holds
+    the static map.
     """
-    _, frames, rows, columns = signal.shape
-    # einsum adds along contiguous numbers several times as fast as mean.
-    row_frame = np.einsum("pfrc->pfr", signal).astype(np.float64) / columns
-    column_frame = np.einsum("pfrc->pfc", signal).astype(np.float64) / rows
-    pixel = np.einsum("pfrc->prc", signal) / np.float32(frames)
-    frame = row_frame.mean(2)
-    mean = frame.mean(1)
+    frames, rows, columns = signal.shape[2:]
+    # einsum adds neighbours several times as fast as mean.
+    row_frame = np.einsum("epfrc->epfr", signal).astype(np.float64) / columns
+    column_frame = np.einsum("epfrc->epfc", signal).astype(np.float64) / rows
+    pixel = np.einsum("epfrc->eprc", signal) / np.float32(frames)
+    frame = row_frame.mean(3)
+    mean = frame.mean(2)
     row_frame -= frame[..., None]
     column_frame -= frame[..., None]
-    row, column = row_frame.mean(1), column_frame.mean(1)
-    frame = frame - mean[:, None]
+    row, column = row_frame.mean(2), column_frame.mean(2)
+    frame = frame - mean[..., None]
     if frames > 1:
-        row_frame -= row[:, None]
-        column_frame -= column[:, None]
-        signal -= pixel[:, None]
+        row_frame -= row[:, :, None]
+        column_frame -= column[:, :, None]
+        signal -= pixel[:, :, None]
         signal -= (row_frame + frame[..., None]).astype(np.float32)[..., None]
-        signal -= column_frame.astype(np.float32)[:, :, None]
-    pixel -= (row + mean[:, None]).astype(np.float32)[:, :, None]
-    pixel -= column.astype(np.float32)[:, None]
-    residual = signal if frames > 1 else pixel[:, None].copy()
+        signal -= column_frame.astype(np.float32)[..., None, :]
+    pixel -= (row + mean[..., None]).astype(np.float32)[..., None]
+    pixel -= column.astype(np.float32)[:, :, None]
+    residual = signal if frames > 1 else pixel[:, :, None].copy()
     return Lines(mean, frame, row_frame, column_frame, row, column), pixel, residual

@@ -1,4 +1,4 @@
-"""What is kept of the pixels of an exposure: sums, maps and rare values, taken in few passes."""
+"""What is kept of the pixels of exposures: sums, maps and rare values, taken in few passes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import TypeVar
 
 import numpy as np
 
@@ -20,26 +19,25 @@ TAILS = (4.5, 7.0, 15.0, -4.0, -6.0)
 LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2), (0, 4), (4, 0))
 GRID = 8
 FAR = min(OUTLIER, *map(abs, TAILS))
-Record = TypeVar("Record", bound=Lines)
 
 
 @dataclass(frozen=True)
-class Exposure(Lines):
-    """An exposure's lines and what is kept of its pixels; of several exposures all have a leading axis.
+class Exposures(Lines):
+    """Lines of exposures with one number of frames, and what is kept of their pixels.
 
-    pixel [plane, row, column]: the static map, DN. scale [plane, frame, row]: spread of the residual in each row, DN,
-    from its mean absolute value (by rms a cosmic hit would hide itself). variance [plane]: of the residual, DN^2.
+    pixel [exposure, plane, row, column]: the static map, DN. scale [exposure, plane, frame, row]: spread of the
+    residual in each row, DN, from its mean absolute value (by rms a cosmic hit would hide itself).
+    variance [exposure, plane]: of the residual, DN^2.
 
-    In units of `scale`: noise [plane, row, column], mean of |residual|, and temporal [plane, row, column], its
-    variance over time, empty with less than three frames; far [tail] and outliers [plane, row, column], how many
-    values lie beyond TAILS and, of the frames of each pixel, beyond OUTLIER. Of the residual cut at +-5:
-    powers [plane, 3], means of its square, cube and fourth power; lags [lag], mean products; later, mean product with
-    the next frame; grid [plane, frame, 8, 8], sums over blocks, in units of the root of their pixels.
+    In units of `scale`: noise [exposure, plane, row, column], mean of |residual|, cut at 5, and temporal, its variance
+    over time, empty with less than three frames; far [exposure, tail] and outliers [exposure, plane, row, column], how
+    many values lie beyond TAILS and, of the frames of each pixel, beyond OUTLIER. Of the residual cut at +-5:
+    powers [exposure, plane, 3], means of its square, cube and fourth power; lags [exposure, lag], mean products;
+    later [exposure], mean product with the next frame; grid [exposure, plane, frame, 8, 8], sums over blocks, in units
+    of the root of their pixels. codes [exposure, plane, 4]: see `histogram_shape`.
 
-    codes [plane, 4]: see `histogram_shape`.
-
-    half_pixel, half_temporal [parity, plane, row, column]: pixel and temporal of the even and of the odd frames; empty
-    where they are not asked for.
+    half_pixel, half_temporal [exposure, parity, plane, row, column]: pixel and temporal of the even and of the odd
+    frames; empty where they are not asked for.
     """
 
     pixel: np.ndarray
@@ -60,8 +58,7 @@ class Exposure(Lines):
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """(planes, frames, rows, columns) of each exposure; rows and columns of a plane."""
-        planes, frames, rows = self.row_frame.shape[-3:]
-        return planes, frames, rows, self.column_frame.shape[-1]
+        return *self.row_frame.shape[1:], self.column_frame.shape[-1]
 
     @cached_property
     def map(self) -> np.ndarray:
@@ -73,8 +70,11 @@ class Exposure(Lines):
         return np.clip(self.map, -BOUND, BOUND)
 
     @cached_property
-    def log_temporal(self) -> np.ndarray:
-        return np.log(self.temporal)
+    def far_on_map(self) -> np.ndarray:
+        """How many values of the static map lie beyond TAILS: [exposure, tail]."""
+        flat = self.map.reshape(len(self.map), -1)
+        at = np.flatnonzero(np.abs(flat) >= FAR)
+        return _beyond_tails(flat.ravel()[at], at // flat.shape[1], len(flat))
 
 
 def normalised(pixel: np.ndarray) -> np.ndarray:
@@ -88,46 +88,49 @@ def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...rc,...rc->...r", a, b).sum(-1, dtype=np.float64)
 
 
-def stacked(ones: Sequence[Record]) -> Record:
-    """Records of exposures of one shape as one, with a leading axis [exposure]."""
-    kind = type(ones[0])
-    return kind(**{one.name: np.stack([getattr(x, one.name) for x in ones]) for one in fields(kind)})
+def joined(some: Sequence[Exposures]) -> Exposures:
+    """Exposures of one shape together."""
+    if len(some) == 1:
+        return some[0]
+    return Exposures(**{one.name: np.concatenate([getattr(x, one.name) for x in some]) for one in fields(Exposures)})
 
 
-def exposure_of(lines: Lines, pixel: np.ndarray, residual: np.ndarray, codes: np.ndarray, *, halves: bool) -> Exposure:
-    """Sums over the residual [plane, frame, row, column], DN, which is overwritten.
+def exposures_of(
+    lines: Lines, pixel: np.ndarray, residual: np.ndarray, codes: np.ndarray, *, halves: bool
+) -> Exposures:
+    """Sums over the residual [exposure, plane, frame, row, column], DN, which is overwritten.
 
-    codes [plane, 4]: of `histogram_shape`. halves: whether even and odd frames are compared.
+    codes [exposure, plane, 4]: of `histogram_shape`. halves: whether even and odd frames are compared.
     """
-    planes, frames, rows, columns = residual.shape
-    squares = np.einsum("pfrc,pfrc->pfr", residual, residual).sum((1, 2), dtype=np.float64)
+    n, _, frames, rows, columns = residual.shape
+    squares = np.einsum("epfrc,epfrc->epfr", residual, residual).sum((2, 3), dtype=np.float64)
     size = np.abs(residual)  # the one array as large as the residual: used again below
-    scale = np.einsum("pfrc->pfr", size) / np.float32(GAUSSIAN_ABS * columns)
+    scale = np.einsum("epfrc->epfr", size) / np.float32(GAUSSIAN_ABS * columns)
     # A row without noise (gain 0, all clipped) must not blow up what little it has.
-    scale = np.maximum(scale, 0.05 * scale.mean((1, 2), keepdims=True) + np.float32(1e-3))
+    scale = np.maximum(scale, 0.05 * scale.mean((2, 3), keepdims=True) + np.float32(1e-3))
     residual /= scale[..., None]
-    half_pixel, half_temporal = _halves(residual, scale, pixel) if halves else (np.zeros(0), np.zeros(0))
-    temporal = temporal_variance(residual)
+    half_pixel, half_temporal = _halves(residual, scale, pixel) if halves else (np.zeros((n, 0)),) * 2
+    temporal = _temporal_variance(residual)
     np.abs(residual, out=size)
-    at = np.flatnonzero(size.ravel() >= FAR)
+    at = np.flatnonzero(size >= FAR)
     far = residual.ravel()[at]
-    noise = np.einsum("pfrc->prc", np.minimum(size, np.float32(BOUND), out=size)) / np.float32(frames)
+    noise = np.einsum("epfrc->eprc", np.minimum(size, np.float32(BOUND), out=size)) / np.float32(frames)
     bounded = np.clip(residual, -BOUND, BOUND, out=residual)
     square = np.multiply(bounded, bounded, out=size)
-    powers = [np.einsum("pfrc->pfr", square), *(np.einsum("pfrc,pfrc->pfr", square, x) for x in (bounded, square))]
-    later = np.einsum("pfrc,pfrc->pfr", bounded[:, 1:], bounded[:, :-1]).sum(dtype=np.float64)
-    return Exposure(
+    powers = [np.einsum("epfrc->epfr", square), *(np.einsum("epfrc,epfrc->epfr", square, x) for x in (bounded, square))]
+    later = np.einsum("epfrc,epfrc->epfr", bounded[:, :, 1:], bounded[:, :, :-1]).sum((1, 2, 3), dtype=np.float64)
+    return Exposures(
         **vars(lines),
         pixel=pixel,
         scale=scale.astype(np.float64),
         variance=squares / (max(frames - 1, 1) * (rows - 1) * (columns - 1)),
         noise=noise,
         temporal=temporal,
-        far=beyond_tails(far),
+        far=_beyond_tails(far, at // residual[0].size, n),
         outliers=_frames_with(at[np.abs(far) > OUTLIER], residual.shape),
-        powers=np.stack([power.sum((1, 2), dtype=np.float64) for power in powers], 1) / (frames * rows * columns),
-        lags=np.array([lag_product(bounded, lag).mean() for lag in LAGS]),
-        later=later / max(planes * (frames - 1) * rows * columns, 1),
+        powers=np.stack([power.sum((2, 3), dtype=np.float64) for power in powers], 2) / (frames * rows * columns),
+        lags=np.stack([lag_product(bounded, lag) for lag in LAGS], 1),
+        later=later / max(residual[0, :, 1:].size, 1),
         grid=grid_of(bounded),
         codes=codes,
         half_pixel=half_pixel,
@@ -135,46 +138,51 @@ def exposure_of(lines: Lines, pixel: np.ndarray, residual: np.ndarray, codes: np
     )
 
 
-def temporal_variance(residual: np.ndarray) -> np.ndarray:
-    """Mean square over the frames, dof counted, of a residual [plane, frame, row, column] of mean 0; kept from 0."""
-    frames = residual.shape[1]
+def _temporal_variance(residual: np.ndarray) -> np.ndarray:
+    """Variance over the frames of a residual [exposure, plane, frame, row, column] of mean 0, kept from 0."""
+    frames = residual.shape[2]
     if frames < VARIANCE_FRAMES:
-        return np.zeros(0, np.float32)
-    return np.einsum("pfrc,pfrc->prc", residual, residual) / np.float32(frames - 1) + np.float32(1e-3)
+        return np.zeros((len(residual), 0), np.float32)
+    return np.einsum("epfrc,epfrc->eprc", residual, residual) / np.float32(frames - 1) + np.float32(1e-3)
 
 
 def _halves(residual: np.ndarray, scale: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Static map, DN, and variance over time of the even and of the odd frames: [parity, plane, row, column]."""
-    some = [residual[:, parity::2] for parity in (0, 1)]
-    pixels = [pixel + np.einsum("pfrc,pfr->prc", x, scale[:, parity::2]) / x.shape[1] for parity, x in enumerate(some)]
-    fewest = residual.shape[1] // 2
-    some = [x - x.mean(1, keepdims=True) if fewest >= VARIANCE_FRAMES else x[:, :0] for x in some]
-    return np.stack(pixels), np.stack([temporal_variance(x) for x in some])
+    """Static map, DN, and variance over time of the even and of the odd frames."""
+    enough = residual.shape[2] // 2 >= VARIANCE_FRAMES
+    pixels, variances = [], []
+    for parity in (0, 1):
+        some = residual[:, :, parity::2]
+        pixels.append(pixel + np.einsum("epfrc,epfr->eprc", some, scale[:, :, parity::2]) / some.shape[2])
+        variances.append(_temporal_variance(some - some.mean(2, keepdims=True) if enough else some[:, :, :0]))
+    return np.stack(pixels, 1), np.stack(variances, 1)
 
 
-def beyond_tails(values: np.ndarray) -> np.ndarray:
-    """How many values lie beyond each of TAILS."""
-    return np.array([np.count_nonzero(values > limit if limit > 0 else values < limit) for limit in TAILS])
+def _beyond_tails(values: np.ndarray, exposure: np.ndarray, n: int) -> np.ndarray:
+    """How many values of each of n exposures lie beyond each of TAILS: [exposure, tail]."""
+    beyond = (values > limit if limit > 0 else values < limit for limit in TAILS)
+    return np.stack([np.bincount(exposure[some], minlength=n) for some in beyond], 1)
 
 
 def _frames_with(places: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Number of frames [plane, row, column] among flat places in [plane, frame, row, column]."""
-    planes, frames, rows, columns = shape
-    plane, pixel = places // (frames * rows * columns), places % (rows * columns)
-    number = np.bincount(plane * rows * columns + pixel, minlength=planes * rows * columns)
-    return number.astype(np.uint16).reshape(planes, rows, columns)
+    """Number of frames [..., row, column] among flat places in an array of a shape [..., frame, row, column]."""
+    size = shape[-2] * shape[-1]
+    number = np.bincount(places // (shape[-3] * size) * size + places % size, minlength=np.prod(shape) // shape[-3])
+    return number.astype(np.uint16).reshape(*shape[:-3], *shape[-2:])
 
 
 def lag_product(x: np.ndarray, lag: tuple[int, int]) -> np.ndarray:
-    """Mean product [n] of pixels `lag` (rows, columns of the sensor) apart, from planes x [plane, n, row, column]."""
-    step = 1 if len(x) == 1 else 2
-    x = x.reshape(step, step, *x.shape[1:])
-    total, size = np.zeros(x.shape[2]), 0
+    """Mean product [exposure] of pixels `lag` (rows, columns of the sensor) apart.
+
+    x: planes [exposure, plane, frame, row, column].
+    """
+    step = 1 if x.shape[1] == 1 else 2
+    x = x.reshape(len(x), step, step, *x.shape[2:])
+    total, size = np.zeros(len(x)), 0
     for (r, next_r, rows), (c, next_c, columns) in product(_neighbours(lag[0], step), _neighbours(lag[1], step)):
-        a = x[r, c, :, : x.shape[3] - rows, max(-columns, 0) : x.shape[4] - max(columns, 0)]
-        b = x[next_r, next_c, :, rows:, max(columns, 0) : x.shape[4] + min(columns, 0)]
-        total += np.einsum("ijnrc,ijnrc->ijnr", a, b).sum((0, 1, 3), dtype=np.float64)
-        size += a.size // len(total)
+        a = x[:, r, c, :, : x.shape[4] - rows, max(-columns, 0) : x.shape[5] - max(columns, 0)]
+        b = x[:, next_r, next_c, :, rows:, max(columns, 0) : x.shape[5] + min(columns, 0)]
+        total += np.einsum("eijfrc,eijfrc->eijfr", a, b).reshape(len(x), -1).sum(1, dtype=np.float64)
+        size += a[0].size
     return total / size
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 from hsnoise.statistics._anova import Lines
-from hsnoise.statistics._exposures import Exposure, inner
+from hsnoise.statistics._exposures import Exposures, inner
 from hsnoise.statistics._sheet import ABS_VARIANCE, Sheet, correlation, correlations, fisher, log_ratio
 
 BANDS = 5
@@ -19,7 +19,7 @@ TINY = 1e-6
 WHITENED_FROM = 2  # the lowest frequencies of a periodogram carry trends, not lines
 
 
-def variances(sheet: Sheet, x: Exposure) -> None:
+def variances(sheet: Sheet, x: Exposures) -> None:
     """Log ratios of the mean squares of the analysis of variance, each the residual variance under white noise."""
     planes, frames, rows, columns = x.shape
     dof = max(frames - 1, 1)
@@ -54,10 +54,10 @@ def _colour_pairs(letters: tuple[str, ...]) -> list[tuple[str, list[int], list[i
         for j in range(i):
             where = "same row" if (j, i) in SAME_ROW else "neighbouring row"
             labels.setdefault(f"{where} of {'-'.join(sorted((letters[j], letters[i])))}", []).append((j, i))
-    return [(label, *map(list, zip(*pairs, strict=True))) for label, pairs in labels.items()]
+    return [(label, [j for j, _ in pairs], [i for _, i in pairs]) for label, pairs in labels.items()]
 
 
-def colours(sheet: Sheet, x: Exposure) -> None:
+def colours(sheet: Sheet, x: Exposures) -> None:
     """Correlations of rows and columns between colours and with their neighbours in space and time."""
     planes, frames, rows, columns = x.shape
     n_rows, n_columns = max(frames - 1, 1) * rows, max(frames - 1, 1) * columns
@@ -76,8 +76,8 @@ def colours(sheet: Sheet, x: Exposure) -> None:
             ("static rows", "same row", x.row, SAME_ROW, rows),
             ("static columns", "same column", x.column, SAME_COLUMN, columns),
         ):
-            first, second = zip(*pairs, strict=True)
-            sheet.add(group, f"correlation, {what}", correlations(moving)[:, first, second], 1 / np.sqrt(n * 2))
+            values = correlations(moving)[:, *np.transpose(pairs)]
+            sheet.add(group, f"correlation, {what}", values, 1 / np.sqrt(n * 2))
     if frames > 2:
         later = _next(x.row_frame, 2)
         sheet.add("row x frame", "correlation with the next frame", later, 1 / np.sqrt(n_rows * planes))
@@ -100,7 +100,7 @@ def _next_line(line: str, planes: int) -> str:
     return f"next {line} of the colour" if planes > 1 else f"next {line}"
 
 
-def scales(sheet: Sheet, x: Exposure) -> None:
+def scales(sheet: Sheet, x: Exposures) -> None:
     """Static profiles by scale and parity, against what the frames' fluctuations leave in their mean."""
     if x.shape[1] == 1:
         return
@@ -121,7 +121,7 @@ def scales(sheet: Sheet, x: Exposure) -> None:
         sheet.add(group, "low-order shape", value, np.sqrt(2 / 3 * frames / (frames - 1)))
 
 
-def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
+def noise_of_rows(sheet: Sheet, x: Exposures) -> None:
     """Whether the noise of single rows differs from frame to frame, and that of neighbours together (interference)."""
     planes, frames, rows, columns = x.shape
     spread = np.log(x.scale)
@@ -173,7 +173,7 @@ def _band_edges(n: int) -> list[int]:
     return (np.unique(np.rint(np.geomspace(1, n + 1, BANDS + 1)).astype(int)) - 1).tolist()
 
 
-def spectra(sheet: Sheet, x: Exposure) -> None:
+def spectra(sheet: Sheet, x: Exposures) -> None:
     """Spectra over rows and columns of what is new in each frame: shape, and coherence of the colours of a line."""
     planes, frames, _, _ = x.shape
     for group, moving, pairs in (
@@ -210,7 +210,7 @@ def periodograms(x: Lines) -> dict[str, np.ndarray]:
     column = x.column_frame.reshape(n, step, step, frames, -1).mean(1).transpose(0, 2, 3, 1)
     moving = {"row x frame": row.reshape(n, frames, -1), "column x frame": column.reshape(n, frames, -1)}
     static = {group: profile[:, None] for group, profile in static_profiles(x).items()}
-    return {group: _whitened(values) for group, values in (moving | static).items()}
+    return {group: _whitened(values, alternating=step > 1) for group, values in (moving | static).items()}
 
 
 def static_profiles(x: Lines) -> dict[str, np.ndarray]:
@@ -237,16 +237,18 @@ def strongest_share(profile: np.ndarray) -> float:
     return float(log_ratio((power[1:] + power[:-1]).max(), power.mean()))
 
 
-def _whitened(series: np.ndarray) -> np.ndarray:
+def _whitened(series: np.ndarray, *, alternating: bool) -> np.ndarray:
     """Periodogram [exposure, frequency] of series [exposure, frame, n], averaged over frames, over a power law.
 
-    About 1 for any 1/f noise.
+    About 1 for any 1/f noise. alternating: the series takes turns between colours of mean zero, so that nothing but
+    rounding is left at half a cycle, which must not bend the law.
     """
     power = np.square(np.abs(np.fft.rfft(series))).mean(1)[:, 1 + WHITENED_FROM :] + 1e-12
     frequency = np.log(np.arange(power.shape[1]) + 1.0 + WHITENED_FROM)
-    frequency -= frequency.mean()
-    log_power = np.log(power)
-    slope = log_power @ frequency / (frequency @ frequency)
+    some = slice(power.shape[1] - alternating)
+    frequency -= frequency[some].mean()
+    log_power = np.log(power[:, some])
+    slope = log_power @ frequency[some] / np.square(frequency[some]).sum()
     return power / np.exp(log_power.mean(1, keepdims=True) + slope[:, None] * frequency)
 
 

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hsnoise.statistics._exposures import (
-    GRID,
-    LAGS,
-    TAILS,
-    VARIANCE_FRAMES,
-    Exposure,
-    beyond_tails,
-    grid_of,
-    inner,
-    lag_product,
-)
+from hsnoise.statistics._exposures import GRID, LAGS, TAILS, VARIANCE_FRAMES, Exposures, grid_of, inner, lag_product
 from hsnoise.statistics._lines import cosines
 from hsnoise.statistics._sheet import ABS_VARIANCE, TINY_DN2, Sheet, correlation, correlations, fisher, log_ratio
 
@@ -22,7 +12,7 @@ STATIC_LAGS = ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
 QUANTILES = np.array([0.01, 0.1, 0.5, 0.9, 0.99, 0.999])
 
 
-def levels(sheet: Sheet, x: Exposure) -> None:
+def levels(sheet: Sheet, x: Exposures) -> None:
     """Mean above black and variance."""
     planes, frames, rows, columns = x.shape
     n = frames * rows * columns
@@ -37,7 +27,7 @@ def levels(sheet: Sheet, x: Exposure) -> None:
         sheet.add("level", "one green over the other", step, np.sqrt(2 / n))
 
 
-def codes(sheet: Sheet, x: Exposure) -> None:
+def codes(sheet: Sheet, x: Exposures) -> None:
     """The histogram of counts: skewness, roughness, ends."""
     planes, frames, rows, columns = x.shape
     n = frames * rows * columns
@@ -48,7 +38,7 @@ def codes(sheet: Sheet, x: Exposure) -> None:
     sheet.add("codes", "share at the white level", white, 0.5 / np.sqrt(n * planes))
 
 
-def lags(sheet: Sheet, x: Exposure) -> None:
+def lags(sheet: Sheet, x: Exposures) -> None:
     """Correlation of the bounded residual with its neighbours on the sensor (of any colour) and in time."""
     planes, frames, rows, columns = x.shape
     n = max(frames - 1, 1) * rows * columns * planes
@@ -65,7 +55,7 @@ def lags(sheet: Sheet, x: Exposure) -> None:
     power = np.maximum(inner(static, static).sum(1) / static[0].size, 1e-12)
     error = 1 / np.sqrt(planes * rows * columns)
     for lag in STATIC_LAGS:
-        value = fisher(lag_product(static.swapaxes(0, 1), lag) / power + _sum_to_zero(x, lag))
+        value = fisher(lag_product(static[:, :, None], lag) / power + _sum_to_zero(x, lag))
         sheet.add("static pixels", f"map, {_away(lag)}", value, error)
 
 
@@ -73,7 +63,7 @@ def _away(lag: tuple[int, int]) -> str:
     return f"{lag[0]} rows {lag[1]} columns away"
 
 
-def _sum_to_zero(x: Exposure, lag: tuple[int, int]) -> float:
+def _sum_to_zero(x: Exposures, lag: tuple[int, int]) -> float:
     """Minus the correlation of white noise at a lag along a row or column of one colour, whose sum is zero."""
     planes, _, rows, columns = x.shape
     step = 1 if planes == 1 else 2
@@ -82,7 +72,7 @@ def _sum_to_zero(x: Exposure, lag: tuple[int, int]) -> float:
     return 1 / (rows - 1 if lag[0] else columns - 1)
 
 
-def tails(sheet: Sheet, x: Exposure) -> None:
+def tails(sheet: Sheet, x: Exposures) -> None:
     """Shape of the residual and, of the static map, how many pixels lie far out."""
     planes, frames, rows, columns = x.shape
     n = max(frames - 1, 1) * rows * columns
@@ -92,9 +82,7 @@ def tails(sheet: Sheet, x: Exposure) -> None:
     sheet.add_colours("tails", "log kurtosis", np.log((fourth / second**2 + 0.01) / 3), np.sqrt(24 / n) / 3)
     _add_tails(sheet, "tails", "residuals", x.far)
     if frames > 1:
-        far = np.abs(x.map) >= min(map(abs, TAILS))
-        numbers = np.stack([beyond_tails(static[some]) for static, some in zip(x.map, far, strict=True)])
-        _add_tails(sheet, "static pixels", "pixels of the map", numbers)
+        _add_tails(sheet, "static pixels", "pixels of the map", x.far_on_map)
         square = np.square(x.bounded_map)
         pixels = rows * columns
         second, fourth = inner(x.bounded_map, x.bounded_map) / pixels, inner(square, square) / pixels
@@ -109,7 +97,7 @@ def _add_tails(sheet: Sheet, group: str, what: str, numbers: np.ndarray) -> None
         sheet.add_count(group, f"{what} {'above' if limit > 0 else 'below'} {limit:g} sigma", number)
 
 
-def variance_over_time(sheet: Sheet, x: Exposure) -> None:
+def variance_over_time(sheet: Sheet, x: Exposures) -> None:
     """Quantiles of the pixels' variances, and whether pixels of large mean vary more (hot ones do)."""
     planes, frames, rows, columns = x.shape
     if frames < VARIANCE_FRAMES:
@@ -119,7 +107,8 @@ def variance_over_time(sheet: Sheet, x: Exposure) -> None:
     for i, q in enumerate(QUANTILES.tolist()):
         error = 1 / np.sqrt(n * planes * min(q, 1 - q))
         sheet.add("pixels over time", f"quantile {q:g} of log variance", quantiles[..., i] - level, error)
-    centred = x.log_temporal - x.log_temporal.mean((2, 3), keepdims=True)
+    centred = np.log(x.temporal)
+    centred -= centred.mean((2, 3), keepdims=True)
     static = x.bounded_map
     power = np.maximum(inner(static, static) * inner(centred, centred), 1e-60)
     value = fisher(inner(static, centred) / np.sqrt(power))
@@ -134,7 +123,7 @@ def _log_quantiles(x: np.ndarray) -> np.ndarray:
     return near[..., 0, :] + (at - below) * (near[..., 1, :] - near[..., 0, :])
 
 
-def frames_over_time(sheet: Sheet, x: Exposure) -> None:
+def frames_over_time(sheet: Sheet, x: Exposures) -> None:
     """Means and noise of whole frames: flicker, drift, jitter. Means are in units of what independent pixels give."""
     planes, frames, rows, columns = x.shape
     if frames == 1:
@@ -166,7 +155,7 @@ def frames_over_time(sheet: Sheet, x: Exposure) -> None:
         sheet.add(group, "correlation of colours, frame mean", pairs, 1 / np.sqrt(6 * (frames - 2)))
 
 
-def blocks(sheet: Sheet, x: Exposure) -> None:
+def blocks(sheet: Sheet, x: Exposures) -> None:
     """Coarse shape of the static map and of the noise: slow cosines and an 8 x 8 grid of blocks.
 
     All is in units of what independent pixels give; a map is common to the colours where planes are summed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -62,16 +63,18 @@ class Sheet:
     """
 
     letters: tuple[str, ...]
-    exposures: Sequence[int]
+    exposures: list[int]
     values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
-    errors: dict[tuple[str, str], np.ndarray | float] = field(default_factory=dict)
+    errors: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     counts: set[tuple[str, str]] = field(default_factory=set)
 
     def add(self, group: str, what: str, values: np.ndarray, error: np.ndarray | float) -> None:
         """The mean of values [exposure, ...] over whatever further axes they have; `error` is that of the mean."""
         n = len(self.exposures)
-        self.values[group, what] = values.reshape(n, -1).sum(1) / (values.size // n)
-        self.errors[group, what] = error
+        if values.ndim > 1:
+            values = values.reshape(n, -1).sum(1) / (values.size // n)
+        self.values[group, what] = values
+        self.errors[group, what] = np.full(n, error)
 
     def add_count(self, group: str, what: str, numbers: np.ndarray) -> None:
         self.add(group, what, numbers, 0.5)
@@ -80,7 +83,7 @@ class Sheet:
     def add_colours(self, group: str, what: str, values: np.ndarray, error: np.ndarray | float) -> None:
         """One statistic a colour from values [exposure, plane]; `error` is that of one plane."""
         for colour, planes in planes_by_colour(self.letters):
-            self.add(group, f"{what}{colour}", values[:, planes], error / np.sqrt(len(planes)))
+            self.add(group, f"{what}{colour}", values[:, planes], error / math.sqrt(len(planes)))
 
 
 def gather(sheets: Sequence[Sheet], half: str, chosen: Sequence[int]) -> dict[tuple[str, str], Entry]:
@@ -89,18 +92,17 @@ def gather(sheets: Sequence[Sheet], half: str, chosen: Sequence[int]) -> dict[tu
     An exposure of few frames has fewer statistics than others: the mean is over those that have one.
     """
     sheet_of = {number: sheet for sheet in sheets for number in sheet.exposures}
-    keys = list(dict.fromkeys(key for number in chosen for key in sheet_of[number].values))
-    number, total, square = np.zeros((3, len(keys)))
-    for sheet in dict.fromkeys(sheet_of[number] for number in chosen):
+    some = dict.fromkeys(sheet_of[number] for number in chosen)
+    place = {key: i for i, key in enumerate(dict.fromkeys(key for sheet in some for key in sheet.values))}
+    number, total, square = np.zeros((3, len(place)))
+    for sheet in some:
+        where = [place[key] for key in sheet.values]
         of = [i for i, exposure in enumerate(sheet.exposures) if exposure in chosen]
-        where = [i for i, key in enumerate(keys) if key in sheet.values]
-        values = np.array([sheet.values[keys[i]] for i in where])[:, of]
-        errors = np.array([np.broadcast_to(sheet.errors[keys[i]], len(sheet.exposures)) for i in where])[:, of]
         number[where] += len(of)
-        total[where] += values.sum(1)
-        square[where] += (errors**2).sum(1)
-    rare = np.array([any(key in sheet.counts for sheet in sheets) for key in keys])
-    value = np.where(rare, np.sqrt(np.maximum(total, 0)), total / number)
-    error = np.where(rare, 0.5, np.sqrt(square) / number)
-    entries = map(Entry, value.tolist(), error.tolist())
-    return {(group, f"{what}, {half}"): entry for (group, what), entry in zip(keys, entries, strict=True)}
+        total[where] += np.array(list(sheet.values.values()))[:, of].sum(1)
+        square[where] += np.square(np.array(list(sheet.errors.values()))[:, of]).sum(1)
+    mean, error = total / number, np.sqrt(square) / number
+    for i in (place[key] for key in set().union(*(sheet.counts for sheet in some))):
+        mean[i], error[i] = math.sqrt(total[i]), 0.5
+    entries = map(Entry, mean.tolist(), error.tolist())
+    return {(group, f"{what}, {half}"): entry for (group, what), entry in zip(place, entries, strict=True)}

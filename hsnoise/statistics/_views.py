@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # its parts are imported when they are used
 
-from hsnoise.statistics._exposures import BOUND, Exposure, normalised
+from hsnoise.statistics._exposures import BOUND, Exposures, normalised
 from hsnoise.statistics._sheet import Entry, fisher, log_ratio
 
 OUTLIERS = (1, 2, 3, 5)
@@ -31,13 +31,13 @@ class View:
     temporal: np.ndarray
 
 
-def views_of(x: Exposure, halves: Sequence[int]) -> list[View]:
+def views_of(x: Exposures, halves: Sequence[int]) -> list[View]:
     """A view of each exposure."""
     maps = (x.map, x.row, x.column, x.temporal)
     return [View(half, *(of[i] for of in maps)) for i, half in enumerate(halves)]
 
 
-def even_and_odd(x: Exposure) -> list[View]:
+def even_and_odd(x: Exposures) -> list[View]:
     """Views of the even and of the odd frames of one exposure, for captures that have no other."""
     views = []
     for parity, (pixel, temporal) in enumerate(zip(x.half_pixel[0], x.half_temporal[0], strict=True)):

@@ -7,7 +7,7 @@ the camera. What decides between effects is mostly correlation: between colours,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
 from hsnoise.statistics._anova import Layout, analyse, check_size, layout_of, read_counts, signal_of
 from hsnoise.statistics._codes import code_step
-from hsnoise.statistics._exposures import VARIANCE_FRAMES, Exposure, exposure_of, stacked
+from hsnoise.statistics._exposures import VARIANCE_FRAMES, Exposures, exposures_of, joined
 from hsnoise.statistics._histograms import histogram_shape
 from hsnoise.statistics._places import Places, places
 from hsnoise.statistics._sheet import TINY_DN2, Entry, Sheet, gather
@@ -40,6 +40,7 @@ class Structure:
 
 
 BATCH_PIXELS = 1 << 20  # of the maps of exposures whose statistics are taken together
+PIXELS_AT_WORK = 1 << 18  # of the frames read together: about what a core's cache holds
 STATISTICS = (
     _pixels.levels,
     _pixels.codes,
@@ -109,81 +110,91 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("short", "long") if n > 1 else ("even", "odd")
-    capture = _Capture([], {}, {}, {}, {}, np.zeros(1, np.uint16))
+    sheets, found, outliers = [], {}, np.zeros(1, np.uint16)
     for numbers in _batches(layout):
-        read = [_read(stack, layout, number, black_level_dn, alone=n == 1) for number in numbers]
-        capture.add(stacked(read), layout, numbers, halves)
-    spectra, profiles, views, levels = (
-        [of[i] for i in range(n)] for of in (capture.spectra, capture.profiles, capture.views, capture.levels)
-    )
+        x = _read(stack, layout, numbers, black_level_dn)
+        sheets.append(_sheet(x, layout.letters, numbers))
+        found |= dict(zip(numbers, _kept(x, [halves[i] for i in numbers]), strict=True))
+        if x.shape[1] >= VARIANCE_FRAMES:
+            outliers = outliers + x.outliers.sum(0, dtype=np.uint16)
+        del x
+    kept = [found[i] for i in range(n)]
+    spectra, views = [of.spectra for of in kept], [view for of in kept for view in of.views]
     entries: dict[tuple[str, str], Entry] = {}
     for half in sorted(set(halves)):
         some = [i for i in range(n) if halves[i] == half]
-        entries |= gather(capture.sheets, f"{names[half]} exposures" if n > 1 else "all frames", some)
+        entries |= gather(sheets, f"{names[half]} exposures" if n > 1 else "all frames", some)
         if n > 1:
             entries |= _peaks([spectra[i] for i in some], f"{names[half]} exposures")
     entries |= _peaks(spectra, "all exposures" if n > 1 else "all frames")
-    entries |= _shares(profiles)
-    seen = [view for of_exposure in views for view in of_exposure]
-    if len(seen) > 1:
-        entries |= _views.persistence(seen, names)
+    entries |= _shares([of.profiles for of in kept])
+    if len(views) > 1:
+        entries |= _views.persistence(views, names)
     if max(layout.frames) > 1:
-        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(seen), 0.15)
+        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(views), 0.15)
     if max(layout.frames) >= VARIANCE_FRAMES:
-        entries |= _views.outlier_counts(capture.outliers)
-    return entries | _curvature(levels, layout)
+        entries |= _views.outlier_counts(outliers)
+    return entries | _curvature(kept, layout)
 
 
 def _batches(layout: Layout) -> list[list[int]]:
-    """Numbers of the exposures whose statistics are taken together: of as many frames, and not too large."""
-    most = max(
-        1, BATCH_PIXELS // ((layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start))
-    )
-    out = []
-    for frames in dict.fromkeys(layout.frames):
-        some = [i for i, number in enumerate(layout.frames) if number == frames]
-        out += [some[start : start + most] for start in range(0, len(some), most)]
-    return out
+    """Numbers of the exposures whose statistics are taken together: of as many frames, and of few pixels."""
+    alike = ([i for i, n in enumerate(layout.frames) if n == frames] for frames in dict.fromkeys(layout.frames))
+    return [numbers for some in alike for numbers in _pieces(some, BATCH_PIXELS // _pixels_of(layout))]
 
 
-def _read(stack: FrameStack, layout: Layout, number: int, black_level_dn: np.ndarray, *, alone: bool) -> Exposure:
-    """One exposure, of which no frames are kept; alone: it is the only one."""
-    counts = read_counts(stack, layout, number)
-    codes = np.array([histogram_shape(plane, stack.white_level) for plane in counts])
-    signal = signal_of(counts, layout, black_level_dn)
-    del counts
-    return exposure_of(*analyse(signal), codes, halves=alone and layout.frames[number] > 1)
+def _pieces(numbers: list[int], most: int) -> list[list[int]]:
+    most = max(most, 1)
+    return [numbers[start : start + most] for start in range(0, len(numbers), most)]
 
 
-@dataclass
-class _Capture:
-    """What is kept of the exposures read so far, by their number; never their frames."""
+def _pixels_of(layout: Layout) -> int:
+    return (layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start)
 
-    sheets: list[Sheet]
-    spectra: dict[int, dict[str, np.ndarray]]
-    profiles: dict[int, dict[str, np.ndarray]]
-    views: dict[int, list[_views.View]]
-    levels: dict[int, tuple[np.ndarray, np.ndarray]]
-    outliers: np.ndarray
 
-    def add(self, x: Exposure, layout: Layout, numbers: list[int], halves: list[int]) -> None:
-        sheet = Sheet(layout.letters, numbers)
-        for statistics in STATISTICS:
-            statistics(sheet, x)
-        self.sheets.append(sheet)
-        if x.shape[1] >= VARIANCE_FRAMES:
-            self.outliers = self.outliers + x.outliers.sum(0, dtype=np.uint16)
-        spectra, profiles = _lines.periodograms(x), _lines.static_profiles(x)
-        views = (
-            [_views.even_and_odd(x)]
-            if x.half_pixel.size
-            else [[view] for view in _views.views_of(x, [halves[i] for i in numbers])]
+def _read(stack: FrameStack, layout: Layout, numbers: list[int], black_level_dn: np.ndarray) -> Exposures:
+    """Exposures with one number of frames, of which no frames are kept."""
+    frames = layout.frames[numbers[0]]
+    found = []
+    for some in _pieces(numbers, PIXELS_AT_WORK // (frames * _pixels_of(layout))):
+        counts = read_counts(stack, layout, some)
+        codes = np.array([[histogram_shape(plane, stack.white_level) for plane in planes] for planes in counts])
+        signal = signal_of(counts, layout, black_level_dn)
+        del counts
+        found.append(exposures_of(*analyse(signal), codes, halves=len(layout.frames) == 1 < frames))
+    return joined(found)
+
+
+def _sheet(x: Exposures, letters: tuple[str, ...], numbers: list[int]) -> Sheet:
+    sheet = Sheet(letters, numbers)
+    for statistics in STATISTICS:
+        statistics(sheet, x)
+    return sheet
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of one exposure besides its sheet; never its frames. mean [plane], DN; variance [plane], DN^2."""
+
+    spectra: dict[str, np.ndarray]
+    profiles: dict[str, np.ndarray]
+    views: list[_views.View]
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+def _kept(x: Exposures, halves: list[int]) -> Iterator[Kept]:
+    """Of each exposure; halves: which half it belongs to."""
+    spectra, profiles = _lines.periodograms(x), _lines.static_profiles(x)
+    views = [_views.even_and_odd(x)] if x.half_pixel.size else [[view] for view in _views.views_of(x, halves)]
+    for i, own in enumerate(views):
+        yield Kept(
+            {group: values[i] for group, values in spectra.items()},
+            {group: values[i] for group, values in profiles.items()},
+            own,
+            x.mean[i],
+            x.variance[i],
         )
-        for i, number in enumerate(numbers):
-            self.spectra[number] = {group: values[i] for group, values in spectra.items()}
-            self.profiles[number] = {group: values[i] for group, values in profiles.items()}
-            self.views[number] = views[i]
-            self.levels[number] = x.mean[i], x.variance[i]
 
 
 def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, str], Entry]:
@@ -223,9 +234,9 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     used = {"row": layout.rows, "column": layout.columns}
 
     def spectra(capture: FrameStack) -> dict[str, np.ndarray]:
-        read = (read_counts(capture, layout, i) for i in range(len(layout.frames)))
+        read = (read_counts(capture, layout, [i]) for i in range(len(layout.frames)))
         lines = (analyse(signal_of(counts, layout, black_level_dn))[0] for counts in read)
-        found = [_lines.periodograms(stacked([x])) for x in lines]
+        found = [_lines.periodograms(x) for x in lines]
         return {axis: np.concatenate([of[f"{axis} x frame"] for of in found]) for axis in used}
 
     step = 1 if layout.cfa == "mono" else 2
@@ -239,23 +250,22 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     return axis, frequency
 
 
-def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -> dict[tuple[str, str], Entry]:
+def _curvature(kept: list[Kept], layout: Layout) -> dict[tuple[str, str], Entry]:
     """How far mean and variance of the middle exposure lie off the line through the first and the last."""
-    if len(exposures) < 3:
+    if len(kept) < 3:
         return {}
-    middle = len(exposures) // 2
+    middle = len(kept) // 2
     first, between, last = layout.exposure_s[[0, middle, -1]]
     share = (between - first) / (last - first) if last > first else 0.5
-    (mean0, variance0), (mean1, variance1), (mean2, variance2) = (exposures[i] for i in (0, middle, -1))
+    mean, variance = (np.stack([getattr(kept[i], of) for i in (0, middle, -1)]) for of in ("mean", "variance"))
     size = np.array([layout.frames[i] for i in (0, middle, -1)])
-    pixels = (layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start)
-    error = float(np.sqrt((len(layout.letters) / (size * pixels)).sum()))
-    sheet = Sheet(layout.letters, (middle,))
-    bent = (mean1 - (1 - share) * mean0 - share * mean2) / np.sqrt(variance1 + TINY_DN2)
+    error = float(np.sqrt((len(layout.letters) / (size * _pixels_of(layout))).sum()))
+    sheet = Sheet(layout.letters, [middle])
+    bent = (mean[1] - (1 - share) * mean[0] - share * mean[2]) / np.sqrt(variance[1] + TINY_DN2)
     sheet.add_colours("level", "curvature of the mean over exposure", bent[None], error)
-    bent = variance1 / ((1 - share) * variance0 + share * variance2 + TINY_DN2)
+    bent = variance[1] / ((1 - share) * variance[0] + share * variance[2] + TINY_DN2)
     sheet.add_colours("noise", "curvature of the variance over exposure", bent[None], error * np.sqrt(2))
-    return {key: Entry(values.item(), float(sheet.errors[key])) for key, values in sheet.values.items()}
+    return {key: Entry(value.item(), sheet.errors[key].item()) for key, value in sheet.values.items()}
 
 
 def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure:
