@@ -91,27 +91,30 @@ def _central(shape: tuple[int, int]) -> tuple[slice, slice]:
     return slice(starts[0], starts[0] + sizes[0]), slice(starts[1], starts[1] + sizes[1])
 
 
-def read_counts(stack: FrameStack, layout: Layout, numbers: Sequence[int]) -> np.ndarray:
-    """Counts [exposure, plane, frame, row, column] of exposures of the layout with one number of frames, DN."""
+def shape_of(layout: Layout, numbers: Sequence[int]) -> tuple[int, int, int, int, int]:
+    """(exposures, planes, frames, rows, columns) of exposures of the layout with one number of frames."""
     step = len(cfa_tile(layout.cfa))
     rows, columns = ((used.stop - used.start) // step for used in (layout.rows, layout.columns))
-    frames = layout.frames[numbers[0]]
-    counts = None
-    for i, number in enumerate(numbers):
-        for f in range(frames):
-            frame = stack.frame(layout.exposures[number], f)[layout.rows, layout.columns]
-            if counts is None:
-                counts = np.empty((len(numbers), step, step, frames, rows, columns), frame.dtype)
-            cells = frame[: rows * step, : columns * step].reshape(rows, step, columns, step)
-            counts[i, :, :, f] = cells.transpose(1, 3, 0, 2)
-    return counts.reshape(len(numbers), step**2, frames, rows, columns)
+    return len(numbers), step**2, layout.frames[numbers[0]], rows, columns
 
 
-def signal_of(counts: np.ndarray, layout: Layout, black_level_dn: np.ndarray) -> np.ndarray:
+def read_counts(stack: FrameStack, layout: Layout, numbers: Sequence[int], out: np.ndarray) -> None:
+    """Counts [exposure, plane, frame, row, column] of exposures of the layout with one number of frames, DN."""
+    n, planes, frames, rows, columns = out.shape
+    step = 1 if planes == 1 else 2
+    for i, f in np.ndindex(n, frames):
+        frame = stack.frame(layout.exposures[numbers[i]], f)[layout.rows, layout.columns]
+        cells = frame[: rows * step, : columns * step].reshape(rows, step, columns, step)
+        out[i, :, f].reshape(step, step, rows, columns)[...] = cells.transpose(1, 3, 0, 2)
+
+
+def signal_of(
+    counts: np.ndarray, layout: Layout, black_level_dn: np.ndarray, out: np.ndarray | None = None
+) -> np.ndarray:
     """Counts above black [exposure, plane, frame, row, column], DN; black_level_dn [channel] or a scalar, DN."""
     tile = cfa_tile(layout.cfa)
     black = np.broadcast_to(np.asarray(black_level_dn, np.float64), (len(channels_of(layout.cfa)),))[tile.ravel()]
-    return np.subtract(counts, black.astype(np.float32)[:, None, None, None], dtype=np.float32)
+    return np.subtract(counts, black.astype(np.float32)[:, None, None, None], out=out, dtype=np.float32)
 
 
 def analyse(signal: np.ndarray) -> tuple[Lines, np.ndarray, np.ndarray]:

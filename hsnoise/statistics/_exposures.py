@@ -96,15 +96,15 @@ def joined(some: Sequence[Exposures]) -> Exposures:
 
 
 def exposures_of(
-    lines: Lines, pixel: np.ndarray, residual: np.ndarray, codes: np.ndarray, *, halves: bool
+    lines: Lines, pixel: np.ndarray, residual: np.ndarray, codes: np.ndarray, spare: np.ndarray, *, halves: bool
 ) -> Exposures:
-    """Sums over the residual [exposure, plane, frame, row, column], DN, which is overwritten.
+    """Sums over the residual [exposure, plane, frame, row, column], DN; it and `spare`, as large, are overwritten.
 
     codes [exposure, plane, 4]: of `histogram_shape`. halves: whether even and odd frames are compared.
     """
     n, _, frames, rows, columns = residual.shape
     squares = np.einsum("epfrc,epfrc->epfr", residual, residual).sum((2, 3), dtype=np.float64)
-    size = np.abs(residual)  # the one array as large as the residual: used again below
+    size = np.abs(residual, out=spare)
     scale = np.einsum("epfrc->epfr", size) / np.float32(GAUSSIAN_ABS * columns)
     # A row without noise (gain 0, all clipped) must not blow up what little it has.
     scale = np.maximum(scale, 0.05 * scale.mean((2, 3), keepdims=True) + np.float32(1e-3))
@@ -114,8 +114,10 @@ def exposures_of(
     np.abs(residual, out=size)
     at = np.flatnonzero(size >= FAR)
     far = residual.ravel()[at]
-    noise = np.einsum("epfrc->eprc", np.minimum(size, np.float32(BOUND), out=size)) / np.float32(frames)
-    bounded = np.clip(residual, -BOUND, BOUND, out=residual)
+    # Few values lie far out: bound those alone.
+    bounded = residual
+    bounded.reshape(-1)[at], size.reshape(-1)[at] = np.clip(far, -BOUND, BOUND), np.minimum(np.abs(far), BOUND)
+    noise = np.einsum("epfrc->eprc", size) / np.float32(frames)
     square = np.multiply(bounded, bounded, out=size)
     powers = [np.einsum("epfrc->epfr", square), *(np.einsum("epfrc,epfrc->epfr", square, x) for x in (bounded, square))]
     later = np.einsum("epfrc,epfrc->epfr", bounded[:, :, 1:], bounded[:, :, :-1]).sum((1, 2, 3), dtype=np.float64)
@@ -164,10 +166,11 @@ def _beyond_tails(values: np.ndarray, exposure: np.ndarray, n: int) -> np.ndarra
 
 
 def _frames_with(places: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Number of frames [..., row, column] among flat places in an array of a shape [..., frame, row, column]."""
+    """Number of frames [..., row, column] among a few flat places in an array of a shape [..., frame, row, column]."""
+    number = np.zeros((*shape[:-3], *shape[-2:]), np.uint16)
     size = shape[-2] * shape[-1]
-    number = np.bincount(places // (shape[-3] * size) * size + places % size, minlength=np.prod(shape) // shape[-3])
-    return number.astype(np.uint16).reshape(*shape[:-3], *shape[-2:])
+    np.add.at(number.reshape(-1), places // (shape[-3] * size) * size + places % size, 1)
+    return number
 
 
 def lag_product(x: np.ndarray, lag: tuple[int, int]) -> np.ndarray:

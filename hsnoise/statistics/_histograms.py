@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 MOST_CODES = 1 << 16
@@ -12,13 +14,15 @@ FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 def histogram_shape(counts: np.ndarray, white_level: float | None) -> tuple[float, float, float, float]:
     """Skewness from quantiles, log roughness, and arcsin of the roots of the shares at zero and at the white level."""
     low, high = int(counts.min()), int(counts.max())
-    above = counts.ravel() - low
-    if high - low > MOST_CODES:
-        np.minimum(above, MOST_CODES, out=above)
-    histogram = np.bincount(above)
+    if 0 <= low and high <= MOST_CODES:
+        histogram = np.bincount(counts.ravel())[low:]
+    else:
+        histogram = np.bincount(np.minimum(counts.ravel() - low, MOST_CODES))
     zero = int(histogram[0]) if low == 0 else 0
     white = 0 if white_level is None else int(histogram[max(int(white_level) - low, 0) :].sum())
-    return *_skewness_and_roughness(low, histogram), *np.arcsin(np.sqrt([zero / above.size, white / above.size]))
+    skewness, roughness = _skewness_and_roughness(low, histogram)
+    at_zero, at_white = (math.asin(math.sqrt(number / counts.size)) for number in (zero, white))
+    return skewness, roughness, at_zero, at_white
 
 
 def _skewness_and_roughness(low: int, histogram: np.ndarray) -> tuple[float, float]:
@@ -36,4 +40,4 @@ def _skewness_and_roughness(low: int, histogram: np.ndarray) -> tuple[float, flo
         return skewness, 0.0
     # Square roots have variance 1 whatever the expected number; a fourth difference does not see a smooth law.
     rough = np.convolve(2 * np.sqrt(some + 0.375), FOURTH_DIFFERENCE, "valid")
-    return skewness, float(np.log(1 + np.mean(rough**2) / (FOURTH_DIFFERENCE**2).sum()))
+    return skewness, math.log(1 + float(rough @ rough) / len(rough) / float(FOURTH_DIFFERENCE @ FOURTH_DIFFERENCE))

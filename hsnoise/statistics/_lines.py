@@ -143,7 +143,8 @@ def _haar(profile: np.ndarray) -> np.ndarray:
     for width in (1 << level for level in range(HAAR_LEVELS)):
         if 2 * width > n:
             break
-        step = total[..., 2 * width :] - 2 * total[..., width:-width] + total[..., : -2 * width]
+        block = total[..., width:] - total[..., :-width]
+        step = block[..., width:] - block[..., :-width]
         out.append(np.square(step, out=step).mean(-1) / (2 * width))
     return np.stack(out)
 

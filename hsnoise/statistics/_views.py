@@ -49,15 +49,16 @@ def even_and_odd(x: Exposures) -> list[View]:
 def persistence(views: list[View], names: tuple[str, str]) -> dict[tuple[str, str], Entry]:
     """Correlations of maps and profiles between exposures: both short, short and long, both long."""
     pixel = np.stack([view.pixel for view in views], 1)
+    bounded = np.clip(pixel, -BOUND, BOUND)
     out = _pairs(views, names, pixel, "static pixels", "raw map")
-    out |= _pairs(views, names, np.clip(pixel, -BOUND, BOUND), "static pixels", "map")
+    out |= _pairs(views, names, bounded, "static pixels", "map")
     out |= _pairs(views, names, np.stack([view.row for view in views], 1), "static rows", "profile")
     out |= _pairs(views, names, np.stack([view.column for view in views], 1), "static columns", "profile")
     timed = [view for view in views if view.temporal.size]
     if len(timed) > 1:
         variance = np.stack([view.temporal for view in timed], 1)
         out |= _pairs(timed, names, np.log(variance), "pixels over time", "log variance")
-        variance = np.minimum(variance, np.float32(MOST_VARIANCE), out=variance)
+        np.minimum(variance, np.float32(MOST_VARIANCE), out=variance)
         out |= _pairs(timed, names, variance, "pixels over time", "variance")
     return out
 
@@ -65,10 +66,13 @@ def persistence(views: list[View], names: tuple[str, str]) -> dict[tuple[str, st
 def _pairs(
     views: list[View], names: tuple[str, str], maps: np.ndarray, group: str, what: str
 ) -> dict[tuple[str, str], Entry]:
-    """artanh of the correlations of maps [plane, view, ...], averaged over planes and the pairs of each kind."""
+    """artanh of the correlations of maps [plane, view, ...], averaged over planes and the pairs of each kind.
+
+    The maps lose their means.
+    """
     planes, n_views = maps.shape[:2]
     flat = maps.reshape(planes, n_views, -1)
-    flat = flat - flat.mean(-1, keepdims=True)
+    flat -= flat.mean(-1, keepdims=True)
     gram = (flat @ flat.transpose(0, 2, 1)).astype(np.float64)
     power = np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-30)
     values = fisher(gram / np.sqrt(power[:, :, None] * power[:, None]) * (1 - np.eye(n_views))).mean(0)

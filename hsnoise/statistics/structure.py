@@ -14,7 +14,7 @@ import numpy as np
 
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
-from hsnoise.statistics._anova import Layout, analyse, check_size, layout_of, read_counts, signal_of
+from hsnoise.statistics._anova import Layout, analyse, check_size, layout_of, read_counts, shape_of, signal_of
 from hsnoise.statistics._codes import code_step
 from hsnoise.statistics._exposures import VARIANCE_FRAMES, Exposures, exposures_of, joined
 from hsnoise.statistics._histograms import histogram_shape
@@ -155,13 +155,16 @@ def _pixels_of(layout: Layout) -> int:
 def _read(stack: FrameStack, layout: Layout, numbers: list[int], black_level_dn: np.ndarray) -> Exposures:
     """Exposures with one number of frames, of which no frames are kept."""
     frames = layout.frames[numbers[0]]
+    pieces = _pieces(numbers, PIXELS_AT_WORK // (frames * _pixels_of(layout)))
+    work = np.empty((2, *shape_of(layout, pieces[0])), np.float32)
     found = []
-    for some in _pieces(numbers, PIXELS_AT_WORK // (frames * _pixels_of(layout))):
-        counts = read_counts(stack, layout, some)
+    for some in pieces:
+        spare, signal = work[:, : len(some)]
+        counts = spare.view(np.int32)
+        read_counts(stack, layout, some, counts)
         codes = np.array([[histogram_shape(plane, stack.white_level) for plane in planes] for planes in counts])
-        signal = signal_of(counts, layout, black_level_dn)
-        del counts
-        found.append(exposures_of(*analyse(signal), codes, halves=len(layout.frames) == 1 < frames))
+        signal_of(counts, layout, black_level_dn, signal)
+        found.append(exposures_of(*analyse(signal), codes, spare, halves=len(layout.frames) == 1 < frames))
     return joined(found)
 
 
@@ -234,9 +237,11 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     used = {"row": layout.rows, "column": layout.columns}
 
     def spectra(capture: FrameStack) -> dict[str, np.ndarray]:
-        read = (read_counts(capture, layout, [i]) for i in range(len(layout.frames)))
-        lines = (analyse(signal_of(counts, layout, black_level_dn))[0] for counts in read)
-        found = [_lines.periodograms(x) for x in lines]
+        found = []
+        for i in range(len(layout.frames)):
+            counts = np.empty(shape_of(layout, [i]), np.int32)
+            read_counts(capture, layout, [i], counts)
+            found.append(_lines.periodograms(analyse(signal_of(counts, layout, black_level_dn))[0]))
         return {axis: np.concatenate([of[f"{axis} x frame"] for of in found]) for axis in used}
 
     step = 1 if layout.cfa == "mono" else 2
