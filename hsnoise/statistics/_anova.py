@@ -10,7 +10,7 @@ import numpy as np
 from hsnoise._core.types import cfa_tile, channels_of
 from hsnoise.frames.stack import FrameStack
 
-MOST_PIXELS = 1 << 25  # of one exposure: 32 Mpixel, about 0.7 GB at work
+MOST_PIXELS = 1 << 25  # of one exposure: 32 Mpixel, about 0.4 GB at work
 MOST_FRAME_PIXELS = 1 << 22  # of one frame
 FEWEST_FRAMES = 4
 SMALLEST = 32  # rows and columns

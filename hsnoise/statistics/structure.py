@@ -40,7 +40,7 @@ class Structure:
 
 
 BATCH_PIXELS = 1 << 20  # of the maps of exposures whose statistics are taken together
-PIXELS_AT_WORK = 1 << 18  # of the frames read together: about what a core's cache holds
+PIXELS_AT_WORK = 1 << 21  # of the frames read together
 STATISTICS = (
     _pixels.levels,
     _pixels.codes,
