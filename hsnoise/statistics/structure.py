@@ -144,6 +144,7 @@ def _batches(layout: Layout) -> list[list[int]]:
 
 
 def _pieces(numbers: list[int], most: int) -> list[list[int]]:
+    """Runs of at most `most` of the numbers, and of at least one."""
     most = max(most, 1)
     return [numbers[start : start + most] for start in range(0, len(numbers), most)]
 
@@ -169,6 +170,7 @@ def _read(stack: FrameStack, layout: Layout, numbers: list[int], black_level_dn:
 
 
 def _sheet(x: Exposures, letters: tuple[str, ...], numbers: list[int]) -> Sheet:
+    """All statistics that exposures have each by itself."""
     sheet = Sheet(letters, numbers)
     for statistics in STATISTICS:
         statistics(sheet, x)
