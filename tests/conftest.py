@@ -32,19 +32,15 @@ def forget_compiled_programs():
 
 @pytest.fixture(autouse=True, scope="session")
 def keep_compiled_programs(tmp_path_factory, worker_id):
-    """On disk, for the modules to come, the other workers and the processes that tests start.
+    """On disk, for the modules to come and for the other workers: most of the tests' time is compilation.
 
-    Most of the tests' time is compilation. A folder named in $JAX_COMPILATION_CACHE_DIR is kept from run to run.
+    A folder named in $JAX_COMPILATION_CACHE_DIR is kept from run to run.
     """
     folder = tmp_path_factory.getbasetemp()
     folder = folder if worker_id == "master" else folder.parent  # workers have folders of their own in one
-    settings = {
-        "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0,
-    }
-    for name, value in settings.items():
-        jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(folder / "compiled"))
 
 
 @pytest.fixture
