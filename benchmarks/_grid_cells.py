@@ -1,4 +1,4 @@
-"""Cells of the grid of hidden effects: which captures there are, and what is measured on one."""
+"""Cells of the grid of hidden effects: the captures, and the measurements on each."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ LAYOUTS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """One capture: what is known about it, and `make`, which gives its FrameStack and its true base parameters.
+    """One capture: its description, and `make`, which gives its FrameStack and its true base parameters.
 
     `about` holds key (unlike that of any other cell), kind ("grid", "layout" or "case"), camera, layout, effect
     ("a+b" for two at once), amplitude and seed.
@@ -57,7 +57,7 @@ class Cell:
 
 
 def hidden_in(effect: str) -> list[str]:
-    """Names of the effects that a cell's `effect` stands for."""
+    """Names of the effects in a cell's `effect`."""
     return [] if effect == CLEAN else effect.split("+")
 
 
@@ -69,8 +69,8 @@ def grid_cells(
     frames: int,
     shape: tuple[int, int],
 ) -> list[Cell]:
-    """Seeds outermost, so that a run that stops early still covers all effects."""
-    # Clean captures have no amplitude: once a seed, whatever the amplitudes.
+    """Cells with seeds outermost, so that a run that stops early still covers all effects."""
+    # Clean captures have no amplitude: one per seed.
     wanted = dict.fromkeys(
         (seed, 0.0 if effect == CLEAN else amplitude, effect, name)
         for seed in seeds
@@ -120,7 +120,7 @@ def _simulated(kind, name, camera: Camera, effect, amplitude, seed, frames, shap
 
 
 def case_cells(folder: Path) -> list[Cell]:
-    """Captures case_*.npz of a folder whose answers.json tells what is hidden in them."""
+    """Captures case_*.npz of a folder whose answers.json lists what is hidden in them."""
     answers = json.loads((folder / "answers.json").read_text())
     return [_case(folder / f"{name}.npz", answer) for name, answer in sorted(answers.items())]
 
@@ -166,11 +166,11 @@ def _true_of_case(base: dict) -> dict[str, float]:
 
 
 def measure(cell: Cell, refit: bool) -> dict[str, Any]:
-    """The record of a cell; if something raises, what was measured until then and the error's text."""
+    """The record of a cell; after an exception, the measurements so far and the error's text."""
     record: dict[str, Any] = {**cell.about, "refit": refit, "seconds": {}, "failure": None}
     try:
         _measure(cell, refit, record)
-    except Exception as problem:  # a grid goes on, whatever fails in one cell
+    except Exception as problem:  # a failed cell must not stop the grid
         record["failure"] = f"{type(problem).__name__}: {problem}"
     return _plain(record)
 
@@ -228,7 +228,7 @@ def _timed(seconds: dict[str, float], stage: str):
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: Python numbers, None for one that is not finite."""
+    """`value` in types that JSON can hold: Python numbers, and None for numbers that are not finite."""
     if isinstance(value, dict):
         return {name: _plain(v) for name, v in value.items()}
     if isinstance(value, list | tuple):

@@ -18,7 +18,7 @@ WITHIN = 4.0  # standard errors
 
 
 def sheets(records: Iterable[dict]) -> list[Sheet]:
-    """All tables that have rows; a record without a verdict (its cell raised) counts in the table of failures only."""
+    """All tables that have rows; records without a verdict (the cell raised) appear only in the table of failures."""
     told, failed = [], []
     for record in records:
         (told if "verdict" in record else failed).append(record)
@@ -39,7 +39,7 @@ def sheets(records: Iterable[dict]) -> list[Sheet]:
 
 
 def is_single(record: dict) -> bool:
-    """One effect of the library is hidden."""
+    """Whether exactly one effect of the library is hidden."""
     hidden = hidden_in(record["effect"])
     return len(hidden) == 1 and hidden[0] not in ODD
 
@@ -53,12 +53,12 @@ def in_first_three(record: dict) -> bool:
 
 
 def named(record: dict) -> bool:
-    """The verdict names the right effect and no other."""
+    """Whether the verdict names the right effect and no other."""
     return record["verdict"] == "named" and record["names"][0] in record["ranks"]
 
 
 def upper_bound(k: int, n: int, confidence: float = 0.95) -> float:
-    """Clopper-Pearson's one-sided upper bound of a rate of which k in n were seen."""
+    """Clopper-Pearson's one-sided upper bound of a rate, from k events in n."""
     return 1.0 if k >= n else float(beta.ppf(confidence, k + 1, n - k))
 
 
@@ -106,7 +106,7 @@ def by_effect(records: list[dict]) -> Sheet:
 
 
 def confusion(records: list[dict]) -> Sheet:
-    """What was first instead of the hidden effect."""
+    """The effects that came first instead of the hidden one."""
     sheet = Sheet("Confusion: another effect first", ("hidden", "first", "verdict", "amplitudes", "count"), left=4)
     wrong = [r for r in records if not first_right(r)]
     of = grouped(wrong, lambda r: (r["effect"], r["top"][0][0] if r["top"] else "–", r["verdict"]))
@@ -163,7 +163,7 @@ def cases(records: list[dict]) -> Sheet:
 
 
 def improvement(records: list[dict]) -> Sheet:
-    """Before and after of cells that were fitted again; of effects without such cells, before of all."""
+    """Errors before and after refits; for effects without refits, before, over all cells."""
     headings = ("hidden", "n", "fitted again", "error before", "after")
     share = f"base parameters within {WITHIN:g} standard errors, before"
     sheet = Sheet("Error (median) and base parameters", (*headings, share, "after"))
@@ -188,7 +188,7 @@ def improvement(records: list[dict]) -> Sheet:
 
 
 def within(record: dict, estimates: str) -> list[bool]:
-    """Of each base parameter with a standard error: is the truth within `WITHIN` of them?"""
+    """For each base parameter with a standard error, whether the truth is within `WITHIN` of them."""
     truth = record["truth"]
     known = [(value, error, truth[name]) for name, (value, error) in record.get(estimates, {}).items()]
     return [abs(value - true) < WITHIN * error for value, error, true in known if error and value is not None]
@@ -206,7 +206,7 @@ def durations(records: list[dict]) -> Sheet:
 def failures(records: list[dict]) -> Sheet:
     sheet = Sheet("Cells that raised", ("cell", "stage", "message"), left=3)
     for record in records:
-        # The stage that raised is the last one that was timed.
+        # The stage that raised is the last that was timed.
         sheet.rows.append((record["key"], next(reversed(record["seconds"]), "–"), record["failure"].splitlines()[0]))
     return sheet
 
@@ -234,7 +234,7 @@ def _text(key: tuple) -> list[str]:
 
 
 def draw_detection(records: Iterable[dict]) -> Figure | None:
-    """How often the hidden effect comes first, against its amplitude; None without such records."""
+    """Share of captures in which the hidden effect comes first, against amplitude; None without records."""
     single = [r for r in records if r["kind"] == "grid" and "verdict" in r and is_single(r)]
     if not single:
         return None

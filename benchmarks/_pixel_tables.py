@@ -1,4 +1,4 @@
-"""What the records of `benchmarks.pixels` say, in tables: one line a kind of sensor."""
+"""Tables of the records of `benchmarks.pixels`: one row per kind of sensor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from hsnoise._core.sheet import Sheet
 
 MEAN_DARK = "mean dark current"  # over all pixels, e-/s
-QUANTILE = 1.96  # of the normal law: intervals of 95 %
+QUANTILE = 1.96  # of the normal distribution: 95 % intervals
 
 
 def deviations(records: Sequence[dict], name: str) -> np.ndarray:
@@ -24,8 +24,8 @@ def deviations(records: Sequence[dict], name: str) -> np.ndarray:
 
 
 def figures(records: Sequence[dict]) -> dict[str, float]:
-    """Of the fits of one kind: relative bias, rms and largest error of the gain; coverage of the 95 % intervals of the
-    values that were given; shares withheld (no value for the gain, or a refusal), broken and trustworthy; seconds."""
+    """For the fits of one kind: relative bias, rms and largest error of the gain; coverage of the 95 % intervals;
+    shares withheld (no value for the gain, or a refusal), broken and trustworthy; seconds."""
     gain = deviations(records, "gain")
     given = gain[np.isfinite(gain[:, 0]), 0]
     out = {
@@ -45,7 +45,7 @@ def figures(records: Sequence[dict]) -> dict[str, float]:
 
 
 def withheld(record: dict) -> bool:
-    """Whether the fit said that there is no gain: NaN in the table, or a refusal instead of a table."""
+    """Whether the fit withheld the gain: NaN in the table, or a refusal instead of a table."""
     if record["broke"] is not None:
         return False
     gains = [value for name, (value, _) in record["table"].items() if name.split(".")[0] == "gain"]
@@ -53,7 +53,7 @@ def withheld(record: dict) -> bool:
 
 
 def determined(records: dict[str, list[dict]]) -> Sheet:
-    """One line a kind whose gain follows from its darks, all kinds together, and the goals."""
+    """One row per kind whose gain follows from its darks, one for all kinds together, and the goals."""
     headings = (
         "kind",
         "bias",
@@ -88,7 +88,7 @@ def determined(records: dict[str, list[dict]]) -> Sheet:
 
 
 def undetermined(records: dict[str, list[dict]]) -> Sheet:
-    """One line a capture from which no gain follows, and the goal."""
+    """One row per capture from which no gain follows, and the goal."""
     headings = ("kind", "called so", "of these refused", "broke", "gains given", "trust", "time")
     sheet = Sheet("No gain follows from these frames", headings)
     for kind, of_kind in records.items():

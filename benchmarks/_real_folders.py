@@ -1,4 +1,4 @@
-"""Captures of real sensors, as folders of files, fitted as their owners would: `hsnoise.load(folder)`, no keyword."""
+"""Captures of real sensors as folders of files, fitted as their owners would: `hsnoise.load(folder)`, no keywords."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ import hsnoise
 from hsnoise._core.sheet import Sheet
 
 COVERED = "covered"  # by the fit's own 95 % interval
-MOST_ERROR = 1 / 3  # of the value; with a larger one nothing is reached
+MOST_ERROR = 1 / 3  # of the value; with a larger error no goal is reached
 CLIPPED = "share clipped at 0"
-DARK_NOISE = "temporal dark noise"  # as EMVA 1288 has it: what pixels, rows, columns and frames change by, e-
+DARK_NOISE = "temporal dark noise"  # as in EMVA 1288: of pixels, rows, columns and frames, e-
 CHANGING = ("read_noise", "row_noise", "column_noise", "frame_offset")
 DRAWS = 32  # frames drawn from a fit: 14 000 clipped pixels of the TC-237, a share known to 1 %
 
 
 @dataclass(frozen=True)
 class Known:
-    """That `parameter` lies from `low` to `high`, in its unit; `goal`: how far outside it may come out, relative, or
-    COVERED. NaN: it must be withheld."""
+    """The truth that `parameter` lies from `low` to `high`, in its unit; `goal`: the relative distance outside that is
+    allowed, or COVERED. NaN: the parameter must be withheld."""
 
     parameter: str
     low: float
@@ -41,8 +41,8 @@ class Known:
 
 @dataclass(frozen=True)
 class Real:
-    """A capture: `place(data, folder)` writes or copies its files to `folder`; each of `says` is a pattern that one of
-    the sentences of the fit, of what loading assumed or of its warnings must match."""
+    """A capture: `place(data, folder)` writes or copies its files to `folder`; each pattern of `says` must match one of
+    the sentences of the fit, of the assumptions of loading, or of the warnings."""
 
     name: str
     place: Callable[[Path, Path], None]
@@ -60,7 +60,7 @@ def data_folder() -> Path:
 
 
 def unpacked(name: str, chosen: str = "") -> Callable[[Path, Path], None]:
-    """Of NAME.npz the arrays whose name matches `chosen`, as FITS files in bias/, dark/ and flat/."""
+    """Write the arrays of NAME.npz whose name matches `chosen` as FITS files in bias/, dark/ and flat/."""
 
     def place(data: Path, folder: Path) -> None:
         about = json.loads((data / f"{name}.json").read_text())
@@ -77,7 +77,7 @@ def unpacked(name: str, chosen: str = "") -> Callable[[Path, Path], None]:
 
 
 def copied(name: str, *folders: str) -> Callable[[Path, Path], None]:
-    """The folder NAME as it is, or of its folders these."""
+    """Copy the folder NAME as it is, or only these of its folders."""
 
     def place(data: Path, folder: Path) -> None:
         for one in folders or sorted(p.name for p in (data / name).iterdir() if p.is_dir()):
@@ -135,7 +135,7 @@ REAL = (
 
 
 def real_sensors(data: Path, only: list[str]) -> Sheet:
-    """A line each: what is known, what the fit says, whether that reaches the goal. Prints every fit as it comes."""
+    """One row each: the truth, the fit, and whether it reaches the goal. Prints each fit when it is done."""
     headings = ("capture", "parameter", "known", "fit", "off", "goal", "reached", "trust", "time", "not said")
     sheet = Sheet("Real sensors, as loaded from their folders", headings, left=2)
     for real in REAL:
@@ -181,7 +181,7 @@ def _value(known: Known, fit) -> tuple[float, float]:
 
 
 def judged(known: Known, value: float, error: float) -> tuple[str, str, str, str]:
-    """(value with error, how far outside the range, goal, whether it is reached) in words."""
+    """(value with error, distance outside the range, goal, whether it is reached) in words."""
     said = "withheld" if np.isnan(value) else f"{value:.4g}" + (f" ± {error:.2g}" if np.isfinite(error) else "")
     nearest = np.clip(value, known.low, known.high)
     off = value / nearest - 1 if nearest else 0.0

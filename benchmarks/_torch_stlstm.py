@@ -1,4 +1,4 @@
-"""The enhancer in PyTorch, with the weights of ours: what its training step is timed against."""
+"""The enhancer in PyTorch, with our weights, to compare the time of a training step."""
 
 from __future__ import annotations
 

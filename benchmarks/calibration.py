@@ -3,7 +3,7 @@
     python -m benchmarks.calibration --seeds 200
 
 Simulates captures (4 exposures x 8 frames x 160 x 240, Bayer), fits each by maximum likelihood and by the paper's
-line, and compares with the truth. Every finished seed is kept in `--out`, so that an interrupted run goes on.
+line, and compares with the truth. Finished seeds are kept in `--out`, so an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def capture(model: hsnoise.NoiseModel, seed: int) -> hsnoise.FrameStack:
 
 
 def one_seed(model: hsnoise.NoiseModel, seed: int) -> dict:
-    """Errors (estimate minus truth) and standard errors of both methods, and the information of the likelihood."""
+    """Errors (estimate minus truth) and standard errors of both methods, and the observed information."""
     summary = hsnoise.summarise(capture(model, seed))
     truth = {name: value for name, (value, _, _) in model.table.items()}
     record = {}
@@ -60,14 +60,14 @@ def one_seed(model: hsnoise.NoiseModel, seed: int) -> dict:
 
 
 def run(seeds: int, out: Path) -> dict[str, list[dict]]:
-    """Records of all configurations and seeds; those already in `out` are not computed again."""
+    """Records of all configurations and seeds; those already in `out` are not recomputed."""
     out.parent.mkdir(parents=True, exist_ok=True)
     done = {}
     if out.exists():
         for line in out.read_text().splitlines():
             try:
                 record = json.loads(line)
-            except ValueError:  # the line that an interruption cut off
+            except ValueError:  # a row that an interruption truncated
                 continue
             done[record["configuration"], record["seed"]] = record
     with out.open("a") as file:

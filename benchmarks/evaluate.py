@@ -1,4 +1,4 @@
-"""Judge a trained enhancer: the command `hsnoise evaluate`, which writes to build/evaluate unless told otherwise.
+"""Score a trained enhancer: the command `hsnoise evaluate`, by default with output to build/evaluate.
 
 python -m benchmarks.evaluate build/train/weights.eqx --clips FOLDER
 """
@@ -11,7 +11,7 @@ from hsnoise.cli import main as cli
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command; raises SystemExit where it does not end well."""
+    """Run the command; raises SystemExit if it fails."""
     code = cli.main(["evaluate", "--out", "build/evaluate", *(sys.argv[1:] if argv is None else argv)])
     if code:
         sys.exit(code)

@@ -6,8 +6,8 @@
     python -m benchmarks.hidden_effect --cases FOLDER --refit
     python -m benchmarks.hidden_effect --report-only
 
-Every finished cell is a line of `--out`, and cells that it holds are not run again, so that an interrupted run goes on
-and runs with other options add to one report: tables on the terminal and beside `--out` as .md, a figure as .png.
+Finished cells are rows of `--out` and are not run again, so an interrupted run resumes, and runs with other options add
+to one report: tables on the terminal and, beside `--out`, as .md, with a figure as .png.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ MOST_MAPS = 50_000  # a Linux process may have 65530 memory maps, and compiled p
 
 
 def read(out: Path) -> dict[str, dict]:
-    """Records in the file by key; the last one counts."""
+    """Records in the file by key; the last of each key counts."""
     records = {}
     for line in out.read_text().splitlines() if out.exists() else ():
         try:
             record = json.loads(line)
-        except ValueError:  # the line that an interruption cut off
+        except ValueError:  # a row that an interruption truncated
             continue
         records[record["key"]] = record
     return records
 
 
 def run(cells: list[Cell], out: Path, refit: bool, minutes: float | None) -> None:
-    """Measure the cells that `out` does not hold yet; one without refit is run again if a refit is wanted."""
+    """Measure the cells that `out` lacks; cells without a refit are run again if a refit is wanted."""
     records = read(out)
     left = [c for c in cells if c.about["key"] not in records or (refit and not records[c.about["key"]]["refit"])]
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def forget_compiled_programs() -> None:
 
 
 def report(out: Path) -> None:
-    """Tables of all records of the file, on the terminal and as Markdown, and the figure."""
+    """Write tables of all records in the file, on the terminal and as Markdown, and the figure."""
     records = list(read(out).values())
     if not records:
         raise SystemExit(f"no records in {out}")
@@ -85,7 +85,7 @@ def report(out: Path) -> None:
 
 
 def cells_of(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> list[Cell]:
-    """The cells that the options ask for."""
+    """The cells that the options select."""
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     if arguments.cases is not None:
         if not (arguments.cases / "answers.json").is_file():
@@ -130,7 +130,7 @@ def shape(text: str) -> tuple[int, int]:
 
 
 def folder_of_cases() -> Path:
-    """Where `--cases` without a folder looks."""
+    """The default folder of `--cases`."""
     return Path(os.environ.get("HSNOISE_SHARED", "shared")) / "cases"
 
 
@@ -143,14 +143,14 @@ def main() -> None:
     add("--amplitudes", type=amplitudes, default=[1.0], help="1 is a modest real sensor (default 1)")
     add("--seeds", type=int, default=1, help="captures of each kind (default 1)")
     add("--first-seed", type=int, default=0)
-    add("--frames", type=int, default=8, help="of each of the four exposures (default 8)")
+    add("--frames", type=int, default=8, help="frames of each of the four exposures (default 8)")
     add("--shape", type=shape, default=(160, 240), help="rows x columns (default 160x240)")
     add("--layouts", action="store_true", help="clean captures of other layouts instead of the grid")
     add("--cases", type=Path, nargs="?", const=folder_of_cases(), help="captures of a folder instead of the grid")
-    add("--refit", action="store_true", help="fit again with the effect that was found, and compare again")
+    add("--refit", action="store_true", help="fit again with the effect found, and compare again")
     add("--minutes", type=float, help="start no new cell after this time")
     add("--out", type=Path, default=Path("build/hidden_effect.jsonl"), help="where finished cells are kept")
-    add("--report-only", action="store_true", help="tables of what is in --out, without running anything")
+    add("--report-only", action="store_true", help="only tables of the records in --out, nothing is run")
     arguments = parser.parse_args()
     if arguments.seeds < 1 or arguments.frames < 1:
         parser.error("--seeds, --frames: expected at least 1")

@@ -1,9 +1,9 @@
-"""Time and peak memory of a fit of a stack much larger than memory should hold: 32 frames of 22 Mpixel on disk.
+"""Time and peak memory of fitting a stack that should not be held in memory: 32 frames of 22 Mpixel on disk.
 
     python -m benchmarks.large_stack
 
-Writes 1.4 GB of simulated raw frames (Canon numbers, four exposures) to `--folder`, once, then fits them from the
-memory-mapped files and tells how long the pass over the pixels and the fit took, and the peak resident memory.
+Writes 1.4 GB of simulated raw frames (Canon numbers, four exposures) to `--folder`, once, fits them from the
+memory-mapped files, and prints the time of the pass over the pixels and of the fit, and the peak resident memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 
 
 def simulate(folder: Path, frames: int, shape: tuple[int, int]) -> None:
-    """One .npy file an exposure, made row block by row block with NumPy."""
+    """Write one .npy file per exposure, made in blocks of rows with NumPy."""
     camera = hsnoise.cameras.canon_5d3(black_level_dn=128)
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def peak_mib() -> float:
-    # Peak of what this process holds itself: pages of the mapped files belong to the file cache.
+    # Peak of the process's own memory: pages of mapped files belong to the file cache.
     for line in Path("/proc/self/status").read_text().splitlines() if Path("/proc/self/status").exists() else ():
         if line.startswith("VmHWM"):
             return int(line.split()[1]) / 1024

@@ -3,9 +3,8 @@
     python -m benchmarks.loop
     python -m benchmarks.loop --effects row_noise,image_lag --no-improve
 
-Times are those after the first compilation in the process: one capture is looked at before the clock starts. The
-yardstick is what NumPy takes for 20 Mpixel of Poisson plus normal draws on the same machine, one thread, in the same
-run.
+Times exclude the first compilation in the process: one capture is processed before the clock starts. The yardstick is
+the time NumPy takes for 20 Mpixel of Poisson plus normal draws on the same machine, one thread, in the same run.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from rich.table import Table
 import hsnoise
 from benchmarks._grid_cells import grid_cells
 
-# Weak and strong ones, of one frame and of many, and one outside the library.
+# Weak and strong effects, within a frame and between frames, and one that the library lacks.
 EFFECTS = (
     "row_noise",
     "column_fixed_pattern",
@@ -32,7 +31,7 @@ EFFECTS = (
     "row_noise+hot_pixels",
     "ramp_37_rows",
 )
-FIRST = "frame_offset"  # what is looked at before the clock starts
+FIRST = "frame_offset"  # processed before the clock starts
 YARDSTICK_PIXELS = 20_000_000
 
 
@@ -70,7 +69,7 @@ def one(effect: str, camera: str, seed: int, improve: bool) -> dict[str, float |
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--effects", default=",".join(EFFECTS), help="hidden effects, a capture each")
+    parser.add_argument("--effects", default=",".join(EFFECTS), help="hidden effects, one capture each")
     parser.add_argument("--camera", default="canon")
     parser.add_argument("--seed", type=int, default=21)
     parser.add_argument("--no-improve", action="store_true", help="leave out improve, which takes the longest")

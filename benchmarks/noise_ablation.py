@@ -1,14 +1,14 @@
-"""Does the better noise model give the better enhancer? On real dark frames, which nobody simulated.
+"""Does a better noise model give a better enhancer? Tested on real dark frames.
 
     python -m benchmarks.noise_ablation --clips FOLDER
 
-The same network and steps are trained with (a) independent Gaussian noise of the sensor's variance, (b) shot and read
-noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that after
-`hsnoise.improve`. They are tested on held-out clips whose light, with shot noise, is added to dark frames of the sensor
-that no fit has seen. From real frames and from drawn ones the level of their darks is taken off. Everything that is
-finished is kept in `--out`; the same command goes on.
+The same network is trained for the same steps with (a) independent Gaussian noise of the sensor's variance, (b) shot
+and read noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that model
+after `hsnoise.improve`. The networks are tested on held-out clips whose light, with shot noise, is added to dark frames
+of the sensor that no fit has seen. Real and drawn frames both have the level of their darks subtracted. Finished parts
+are kept in `--out`; the same command resumes.
 
-The sensors are those of a folder outside the project (HSNOISE_SHARED, or ../shared).
+The sensors' data are in a folder outside the project (HSNOISE_SHARED, or ../shared).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import GREY, display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.enhance.mosaic import electrons_of
-from hsnoise.enhance.training.clips import LONG, Clip, check_sizes, crops, held_out, read_clips
+from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
@@ -74,7 +74,7 @@ class Sensor:
         From differences of frames.
         """
         apart = np.diff(self.fitted_darks, axis=0)
-        # Cosmic rays are rare and huge: differences that are far outside the others count as just outside.
+        # Cosmic rays are rare and huge: differences far outside the others are clipped to just outside.
         low, high = np.quantile(apart, [0.1587, 0.8413])
         far = OUTSIDE * (high - low) / 2
         return float(np.sqrt(np.mean(np.clip(apart, -far, far) ** 2) / 2 - ROUNDING_VARIANCE))
@@ -98,11 +98,11 @@ def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
         )
 
     def imx541() -> Sensor:
-        # Rows that darks and flats have in common; six of the eight frames of an exposure are fitted.
+        # The rows that darks and flats share; six of the eight frames of an exposure are fitted.
         data, about = read("imx541_mono_emva")
         darks = {n: (slice(6), slice(128)) for n in ("dark_000025us", "dark_006443us")}
         flats = {n: (slice(None), slice(128)) for n in ("flat_000272us", "flat_000985us")}
-        # At most 6 ms without light and cooled: the exposures do not differ but in length.
+        # At most 6 ms without light, and cooled: the exposures differ only in length.
         unseen = np.concatenate([data[n][6:] for n in data.files if n.startswith("dark")])
         return Sensor("imx541", stack(data, about, darks | flats, 4095), unseen, about["dark_000272us"]["exposure_s"])
 
@@ -123,7 +123,7 @@ def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
 
 
 def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
-    """The four noise models, kept as files."""
+    """The four noise models, saved as files."""
     paths = {name: out / f"{sensor.name}-{name}.json" for name in NOISES}
     if not paths["paper"].exists():
         print(f"{sensor.name}: fitting")
@@ -134,7 +134,7 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
         light_e = GREY * float(np.sqrt(DIM * BRIGHT)) * sigma
         for name in ("gaussian", "poisson-gaussian"):
             matched(params, name, light_e, sigma**2).save(paths[name])
-        params.save(paths["paper"])  # the last: it says that all three are there
+        params.save(paths["paper"])  # written last: it shows that all three exist
     if not paths["improved"].exists():
         print(f"{sensor.name}: improving")
         with busy("Fitting the first model") as say:
@@ -152,9 +152,9 @@ def level_of(darks: np.ndarray) -> float:
 
 
 def levelled(camera: Camera, level_dn: float) -> Camera:
-    """The camera whose frames without light lie at `level_dn`: what a user takes off is what dark frames show.
+    """The camera with the black level at which dark frames have the mean `level_dn`, as a user would subtract it.
 
-    A noise model is judged by its noise then, not by the level that its fit happens to have at one exposure.
+    So a noise model is judged by its noise, not by its fitted level at one exposure.
     """
     model = camera.model
     dark_dn = np.asarray(model["gain"].value) * float(model["dark_current"].rate) * model.exposure_s
@@ -166,7 +166,7 @@ def drawn_darks(noise: NoiseModel) -> np.ndarray:
 
 
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
-    """Weights of a network that was trained with the noise called `name`."""
+    """Path of the weights of a network trained with the noise called `name`."""
     camera = levelled(camera, level_of(drawn_darks(noise)))
     sizes = (options.stride, options.side, options.jitter, camera.sensor)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
@@ -196,7 +196,7 @@ def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
 def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Display values and noisy light [frame, row, column, 1]: light and its shot noise on unseen real dark frames.
 
-    As many frames as there are dark ones; a place of the sensor that depends on the seed.
+    As many frames as there are dark frames; the seed chooses the place on the sensor.
     """
     rng = np.random.default_rng(seed)
     white_e = float(np.exp(rng.uniform(*np.log(camera.white_e))))
@@ -213,7 +213,7 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
 
 
 def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> dict[str, float]:
-    """PSNR of each clip, dB, mean over several places of the sensor: places share what is hard about a clip."""
+    """PSNR of each clip, dB, mean over several places on the sensor, which share the difficulty of a clip."""
     net, _ = load_network(path)
     video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
 
@@ -228,7 +228,7 @@ def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], 
 
 
 def table_of(results: dict[str, dict[str, list[dict[str, float]]]]) -> Sheet:
-    """Mean PSNR of each sensor and noise over seeds and their clips, and its gain over (b) with a standard error."""
+    """Mean PSNR of each sensor and noise over seeds and clips, and the gain over (b) with its standard error."""
     head = ("sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian")
     rows = []
     for sensor, of in results.items():
@@ -242,10 +242,10 @@ def table_of(results: dict[str, dict[str, list[dict[str, float]]]]) -> Sheet:
 
 
 def gain_of(apart: list[dict[str, float]]) -> tuple[float, float]:
-    """Mean of differences {clip: dB} of several seeds, and its standard error: over clips, or seeds if that is more.
+    """Mean of differences {clip: dB} of several seeds, and its standard error: over clips or seeds, if larger.
 
-    Seeds hold out other clips, so that the scatter between clips is in both; that between trainings is in the second.
-    Where more seeds repeat the clips, the scatter between clips is in the first alone: both are added.
+    Seeds hold out different clips, so both contain the scatter between clips, and the second that between trainings.
+    If more seeds repeat the clips, only the first contains the scatter between clips, and both are added.
     """
     of_clips = [[of[clip] for of in apart if clip in of] for clip in sorted({clip for of in apart for clip in of})]
     of_seeds = [list(of.values()) for of in apart]
@@ -257,7 +257,7 @@ def gain_of(apart: list[dict[str, float]]) -> tuple[float, float]:
 
 
 def standard_error(means: Sequence[float]) -> float:
-    """Of the mean of these means; 0 of one, which says nothing of it."""
+    """Standard error of the mean of these means; 0 for a single one, which cannot show it."""
     return float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
 
 
@@ -266,11 +266,11 @@ def main(argv: list[str] | None = None) -> None:
     add = parser.add_argument
     add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
     add("--sensors", default="imx541,stl1001,tc237", help="default: imx541,stl1001,tc237")
-    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out other clips (default: 4)")
-    add("--steps", type=int, default=2000, help="of each training (default: 2000)")
-    add("--maps", type=int, default=12, help="of the network (default: 12)")
-    add("--stride", type=int, default=2, help="pixels of a block of the network: 4 see twice as far (default: 2)")
-    add("--side", type=int, default=32, help="of the pieces to train on, pixels (default: 32)")
+    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out different clips (default: 4)")
+    add("--steps", type=int, default=2000, help="steps of each training (default: 2000)")
+    add("--maps", type=int, default=12, help="feature maps of the network (default: 12)")
+    add("--stride", type=int, default=2, help="side of a block of the network: 4 sees twice as far (default: 2)")
+    add("--side", type=int, default=32, help="side of the training crops, pixels (default: 32)")
     add(
         "--jitter",
         type=float,
@@ -278,7 +278,7 @@ def main(argv: list[str] | None = None) -> None:
         help="rms by which the logarithms of the noise's parameters vary in training (default: 0, the fit as it is:"
         " a dark current that varies moves the black of all noises but the Gaussian, which has it in its black level)",
     )
-    add("--places", type=int, default=3, help="on the sensor, for each clip (default: 3)")
+    add("--places", type=int, default=3, help="places on the sensor for each clip (default: 3)")
     add("--out", type=Path, default=Path("build/ablation"), help="default: build/ablation")
     options = parser.parse_args(argv)
     folder = Path(os.environ.get("HSNOISE_SHARED", "../shared")) / "data"
@@ -286,7 +286,7 @@ def main(argv: list[str] | None = None) -> None:
     if not folder.is_dir() or set(asked) - set(known):
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
     if options.seeds < 2:
-        parser.error(f"--seeds: expected at least 2, as trainings scatter, too; got {options.seeds}")
+        parser.error(f"--seeds: expected at least 2, because trainings scatter; got {options.seeds}")
     if not 0 <= options.jitter <= 1:
         parser.error(f"--jitter: expected 0 to 1, got {options.jitter:g}")
     for option in ("steps", "maps", "stride", "side", "places"):
@@ -308,7 +308,7 @@ def main(argv: list[str] | None = None) -> None:
         camera = camera_of(sensor, models["paper"])
         of: dict[str, list[dict[str, float]]] = {noise: [] for noise in NOISES}
         for seed, (train, kept) in enumerate(folds):
-            shown = [clip for clip in kept if not clip.name.endswith(LONG)]
+            shown = [clip for clip in kept if not clip.is_long]
             for noise in NOISES:
                 path = trained(camera, noise, models[noise], train, seed, options)
                 of[noise].append(measured(sensor, path, camera, shown, options.places))

@@ -1,8 +1,8 @@
-"""A simulator of dark captures of sensors whose pixels differ, in NumPy; it shares no code with hsnoise.
+"""A simulator, in NumPy, of dark captures of sensors whose pixels differ; it shares no code with hsnoise.
 
-`draw(sensor, rng)` gives counts and what is true of the pixels drawn. `DETERMINED` are eight kinds of sensor whose gain
+`draw(sensor, rng)` gives counts and the truth of the pixels drawn. `DETERMINED` are eight kinds of sensor whose gain
 follows from darks alone: at the longest exposure an ordinary pixel collects about as many electrons as the square of
-its read noise. `UNDETERMINED` are five captures from which no gain follows, whatever is done with them.
+its read noise. `UNDETERMINED` are five captures from which no method can determine the gain.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ PARETO_EXPONENT = 2.5  # of the tail of hot pixels' rates: a density that falls 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor, how it is read, and the series of darks that is taken with it.
+    """A sensor, its readout, and the series of darks taken with it.
 
     One gain is a mono sensor, three are an RGGB mosaic. `dark_e_per_s` is the mean over the ordinary pixels, the read
     noise the rms over pixels. `spread` is the standard deviation of the logarithm of the dark current over pixels
     (log-normal, and within each of the two groups of "bimodal") or of the dark current over its mean (gamma);
     `second_share` of the pixels of "bimodal" have `second_ratio` times the dark current of the rest. A share
-    `hot_share` of all pixels has one slow centre more, of mean rate `hot_e_per_s` and of law `hot_law`, whose electrons
-    come with the Fano factor `hot_fano` (0.5 to 1, over times in which many come). In DN, standard deviations:
-    `offset_spread_dn` of pixels, `column_pattern_dn`, `row_pattern_dn` fixed, `row_noise_dn` and `frame_jitter_dn` new
-    in each frame, `pedestal_jump_dn` new at each exposure.
+    `hot_share` of all pixels has an extra slow centre of mean rate `hot_e_per_s` and distribution `hot_law`, whose
+    electrons have the Fano factor `hot_fano` (0.5 to 1, over times in which many come). Standard deviations in DN:
+    `offset_spread_dn` of pixels, `column_pattern_dn` and `row_pattern_dn` fixed, `row_noise_dn` and `frame_jitter_dn`
+    new in each frame, `pedestal_jump_dn` new at each exposure.
     """
 
     gain_dn_per_e: tuple[float, ...]
@@ -72,10 +72,9 @@ def draw(sensor: Sensor, rng: np.random.Generator) -> dict:
     """One sensor of the kind and one series of darks.
 
     Returns:
-        What the user knows: counts (a list of uint16 arrays [frame, row, column], one an exposure), exposure_s,
-        black_level (None where it is not stated), white_level, cfa, shutter. Maps [row, column] of what is true:
-        ordinary_e_per_s and hot_e_per_s (their sum is a pixel's dark current), read_noise_e, offset_dn (without the
-        black level).
+        Known to the user: counts (a list of uint16 arrays [frame, row, column], one per exposure), exposure_s,
+        black_level (None if not stated), white_level, cfa, shutter. True maps [row, column]: ordinary_e_per_s and
+        hot_e_per_s (their sum is a pixel's dark current), read_noise_e, offset_dn (without the black level).
     """
     ordinary, hot, read, offset = (f(sensor, rng) for f in (ordinary_rates, hot_rates, read_noises, offsets))
     counts = [_exposure(sensor, t, ordinary, hot, read, offset, rng) for t in sensor.exposure_s]
@@ -106,7 +105,7 @@ def ordinary_rates(sensor: Sensor, rng) -> np.ndarray:
 
 
 def hot_rates(sensor: Sensor, rng) -> np.ndarray:
-    """Dark current of each pixel's hot centre, e-/s [row, column]; 0 where there is none."""
+    """Dark current of each pixel's hot centre, e-/s [row, column]; 0 without one."""
     if sensor.hot_law == "pareto":
         size = (1 + rng.pareto(PARETO_EXPONENT, sensor.shape)) * (PARETO_EXPONENT - 1) / PARETO_EXPONENT
     else:
@@ -121,7 +120,7 @@ def read_noises(sensor: Sensor, rng) -> np.ndarray:
 
 
 def offsets(sensor: Sensor, rng) -> np.ndarray:
-    """What stays of each pixel's level, DN [row, column]: pixels, columns and rows."""
+    """Fixed offset of each pixel, DN [row, column]: of pixels, columns and rows."""
     rows, columns = sensor.shape
     return (
         sensor.offset_spread_dn * rng.standard_normal((rows, columns))
@@ -131,22 +130,22 @@ def offsets(sensor: Sensor, rng) -> np.ndarray:
 
 
 def two_step_counts(mean: np.ndarray, fano: float, rng) -> np.ndarray:
-    """Electrons of a centre that emits a hole and an electron in turn, in a time in which `mean` come.
+    """Electrons of a centre that emits a hole and an electron in turn, in a time in which `mean` are expected.
 
-    Both steps wait an exponential time; the mean waits are u and 1 - u of a cycle, with u^2 + (1 - u)^2 = fano. What
-    comes is an equilibrium renewal process of variance m - 2 w m + 2 w^2 (1 - exp(-m / w)), w = u (1 - u). Drawn
-    exactly: the waits of 2^k cycles are two gamma variables, and the time's end is found in them by halving, with the
-    shares of the halves beta variables.
+    Both steps wait an exponential time; the mean waits are u and 1 - u of a cycle, with u^2 + (1 - u)^2 = fano. The
+    electrons form an equilibrium renewal process of variance m - 2 w m + 2 w^2 (1 - exp(-m / w)), w = u (1 - u). It is
+    drawn exactly: the waits of 2^k cycles are two gamma variables, and bisection finds the end of the time in them,
+    where the shares of the halves are beta variables.
     """
     if fano == 1:
         return rng.poisson(mean)
     first = (1 + np.sqrt(2 * fano - 1)) / 2
     left = np.array(mean, float)
-    midway = rng.random(left.shape) >= first  # the hole is out already when the exposure begins
+    midway = rng.random(left.shape) >= first  # the hole has been emitted before the exposure begins
     left -= np.where(midway, rng.exponential(1 - first, left.shape), 0.0)
     counts = np.where(midway & (left > 0), 1, 0)
     top = max(float(left.max(initial=0.0)), 0.0)
-    size = 2 ** int(np.ceil(np.log2(top + 10 * np.sqrt(top) + 40)))  # as many cycles never fit
+    size = 2 ** int(np.ceil(np.log2(top + 10 * np.sqrt(top) + 40)))  # so many cycles never fit
     waits = [first * rng.gamma(size, size=left.shape), (1 - first) * rng.gamma(size, size=left.shape)]
     while size > 1:
         size //= 2
@@ -317,8 +316,8 @@ UNDETERMINED = {
         black_dn=10.3,
         white_dn=4095,
     ),
-    # Offsets of pixels that are larger than the spread of their dark signal, so that neither levels nor differences
-    # between pixels tell how much of either is dark signal.
+    # Offsets of pixels exceed the spread of their dark signal, so neither levels nor differences between pixels show
+    # how much of either is dark signal.
     "one exposure": Sensor(
         (1.0,), read_noise_e=8.0, exposure_s=(60.0,), dark_e_per_s=0.5, spread=0.1, offset_spread_dn=8.0, frames=16
     ),
@@ -332,7 +331,7 @@ UNDETERMINED = {
         hot_fano=0.7,
         offset_spread_dn=2.0,
     ),
-    # Dark signal too small against the read noise for the skewness of its law to tell the gain.
+    # Dark signal too small relative to the read noise for its skewness to determine the gain.
     "pedestal jumps": Sensor(
         (1.0,),
         read_noise_e=15.0,

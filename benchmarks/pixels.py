@@ -5,13 +5,13 @@
     python -m benchmarks.pixels --real
 
 Sensors of `benchmarks.pixel_simulator` (256 x 384 pixels, no code of hsnoise): eight kinds whose gain follows from the
-darks, five from which none does. Every finished fit is kept in `--out`, so that an interrupted run goes on. With
+darks, five from which none does. Finished fits are kept in `--out`, so an interrupted run resumes. With
 --real: captures of real sensors, as folders of files, from ../shared/data (or $HSNOISE_SHARED/data).
 
-Like is compared with like. The truth is that of the pixels that were drawn, not of the law they came from. The read
-noise is the rms over pixels, as `read_noise.sigma` is. Where hot pixels begin, and whether a second group of pixels is
-one of them, is for each fit to say; its mean over all pixels is not. So the dark current here is that mean, hot pixels
-included: `dark_current.rate`, and `hot_pixels.fraction` times `hot_pixels.rate` where the fitted model has them.
+Like is compared with like. The truth is that of the drawn pixels, not of their distribution. The read noise is the rms
+over pixels, like `read_noise.sigma`. Each fit decides where hot pixels begin, and whether a second group of pixels is
+hot; the mean dark current over all pixels does not depend on that. So the dark current here is this mean:
+`dark_current.rate`, plus `hot_pixels.fraction` times `hot_pixels.rate` if the fitted model has them.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ KNOWN = ("exposure_s", "black_level", "white_level", "cfa", "shutter")
 
 
 def one_fit(kind: str, seed: int, method: str) -> dict:
-    """A record: what was fitted and what is true of one simulated capture."""
+    """A record of one simulated capture: fit and truth."""
     drawn = draw(KINDS[kind], np.random.default_rng([zlib.crc32(kind.encode()), seed]))
     record = {"kind": kind, "seed": seed, "method": method, "refused": None, "broke": None, "trustworthy": False}
     record |= {"table": {}, "truth": {}, "doubts": []}
     began = time.perf_counter()
     try:
         fit = hsnoise.fit(drawn["counts"], method=method, **{name: drawn[name] for name in KNOWN})
-    except np.linalg.LinAlgError as failure:  # a ValueError, but no refusal: nobody meant it for the user
+    except np.linalg.LinAlgError as failure:  # a ValueError, but not an intended refusal
         return record | {"broke": str(failure), "seconds": time.perf_counter() - began}
     except ValueError as refusal:
         return record | {"refused": str(refusal), "seconds": time.perf_counter() - began}
@@ -61,7 +61,7 @@ def one_fit(kind: str, seed: int, method: str) -> dict:
 
 
 def mean_dark_current(fit) -> tuple[float, float]:
-    """Mean over all pixels and its standard error, e-/s; hot pixels included where they are an effect of their own."""
+    """Mean over all pixels and its standard error, e-/s; includes hot pixels if the model has them separately."""
     slopes = {"dark_current.rate": 1.0}
     value = fit.table["dark_current.rate"][0]
     if "hot_pixels" in fit.params.names:
@@ -75,7 +75,7 @@ def mean_dark_current(fit) -> tuple[float, float]:
 
 
 def truth_of(kind: str, drawn: dict) -> dict[str, float]:
-    """Parameter name to what is true of the pixels drawn; without those that are 0."""
+    """Parameter name to the truth of the drawn pixels, without zeros."""
     gains = KINDS[kind].gain_dn_per_e
     names = ["gain"] if len(gains) == 1 else ["gain.R", "gain.G", "gain.B"]
     truth = dict(zip(names, gains, strict=True))
@@ -90,7 +90,7 @@ def kept(out: Path, method: str) -> dict[tuple[str, int], dict]:
     for line in out.read_text().splitlines() if out.exists() else ():
         try:
             record = json.loads(line)
-        except ValueError:  # empty, or cut off by an interruption
+        except ValueError:  # empty, or truncated by an interruption
             continue
         if record["method"] == method:
             done[record["kind"], record["seed"]] = record
@@ -98,7 +98,7 @@ def kept(out: Path, method: str) -> dict[tuple[str, int], dict]:
 
 
 def fitted(tasks: list[tuple[str, int, str]], workers: int) -> Iterator[dict]:
-    """Records of all tasks, as they come."""
+    """Records of all tasks, in the order in which they finish."""
     if workers == 1:
         yield from (one_fit(*task) for task in tasks)
         return
@@ -108,14 +108,14 @@ def fitted(tasks: list[tuple[str, int, str]], workers: int) -> Iterator[dict]:
 
 
 def run(kinds: list[str], seeds: int, workers: int, method: str, out: Path) -> dict[str, list[dict]]:
-    """Records of each kind; those already in `out` are not computed again."""
+    """Records of each kind; those already in `out` are not recomputed."""
     out.parent.mkdir(parents=True, exist_ok=True)
     done = kept(out, method)
     tasks = [(kind, seed, method) for kind in kinds for seed in range(seeds) if (kind, seed) not in done]
     with out.open("a") as file:
         records = fitted(tasks, workers)
         for record in track(records, "Fitting", total=len(tasks), console=Console(stderr=True)):
-            file.write("\n" + json.dumps(record))  # the new line ends one that an interruption cut off
+            file.write("\n" + json.dumps(record))  # ends a row that an interruption truncated
             file.flush()
             done[record["kind"], record["seed"]] = record
     return {kind: [done[kind, seed] for seed in range(seeds)] for kind in kinds}
@@ -129,7 +129,9 @@ def main() -> None:
     parser.add_argument("--method", choices=("auto", "ml", "line", "transfer"), default="auto")
     parser.add_argument("--out", type=Path, default=Path("build/pixels.jsonl"), help="where finished fits are kept")
     parser.add_argument("--real", action="store_true", help="real sensors instead")
-    parser.add_argument("--only", nargs="+", default=[], metavar="WORD", help="with --real: those whose name has it")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="WORD", help="with --real: only captures whose name contains WORD"
+    )
     arguments = parser.parse_args()
     for name in ("seeds", "workers"):
         if getattr(arguments, name) < 1:

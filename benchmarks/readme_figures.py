@@ -1,4 +1,4 @@
-"""The two pictures at the head of the README: a dark frame beside samples, and the error over the steps of the story.
+"""The two figures at the top of the README: a dark frame beside samples, and the error over the steps of the story.
 
     python -m benchmarks.readme_figures
 
@@ -21,16 +21,17 @@ from hsnoise import plots
 from hsnoise._core.output import write_figure
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import darks_of, draw_capture
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 
-ROWS, COLUMNS = slice(10, 190), slice(20, 290)  # of the frames that are shown
-STRETCH = (0.5, 99.9)  # percentiles of the measured frame that are black and white
+ROWS, COLUMNS = slice(10, 190), slice(20, 290)  # the part of the frames that is shown
+STRETCH = (0.5, 99.9)  # percentiles of the measured frame shown as black and white
 INK = ("#404040", "#0072B2", "#D55E00")
 NAMES = ("measured: a CCD in the dark", "textbook model: Poisson and Gaussian", "what hsnoise made of it")
 
 
 def textbook(stack: FrameStack, gain: float) -> NoiseModel:
-    """Shot noise of the mean dark signal and Gaussian read noise, as strong as the noise of the longest darks."""
+    """Shot noise of the mean dark signal and Gaussian read noise, together as strong as that of the longest darks."""
     counts = np.stack(list(stack.frames(len(stack.counts) - 1))).astype(float)
     noise_dn = np.sqrt(np.median(counts.var(0, ddof=1)))
     effects = [fx.ReadNoise(noise_dn / gain), fx.Gain(gain), fx.BlackLevel(float(counts.mean())), fx.ADC()]
@@ -38,8 +39,8 @@ def textbook(stack: FrameStack, gain: float) -> NoiseModel:
 
 
 def hero(stack: FrameStack, model: NoiseModel) -> Figure:
-    """The mean of the longest darks, that of the textbook and of the fitted model, and below each its column means."""
-    darks = darks_of(stack)
+    """The mean of the longest darks, measured, of the textbook model and of the fitted one, with column means below."""
+    darks = Portion.of(stack).darks.frames
     plain = textbook(darks, float(np.asarray(model["gain"].value).ravel()[0]))
     drawn = (darks, draw_capture(1, plain, darks), draw_capture(1, model, darks))
     means = [np.mean(list(of.frames(len(of.counts) - 1)), axis=0, dtype=float) for of in drawn]

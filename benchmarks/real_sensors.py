@@ -1,4 +1,4 @@
-"""Fits of real sensors whose captures lie in a folder outside the project (HSNOISE_SHARED, or ../shared).
+"""Fits of real sensors, with captures from a folder outside the project (HSNOISE_SHARED, or ../shared).
 
     python -m benchmarks.real_sensors
     python -m benchmarks.real_sensors --improve
@@ -6,7 +6,7 @@
 IMX541 (darks and flats): gain and read noise beside the values that the source reports, and the local gain against
 signal as a figure. TC-237 (bias frames clipped at 0): clipped fraction, whole frame and by thirds of the columns.
 STL-1001 (darks at two temperatures, flats): dark current. With --improve instead: what the paper's model lacks in each,
-told by `hsnoise.improve`, and the dark means of an A7S2 against exposure as a figure.
+according to `hsnoise.improve`, and the dark means of an A7S2 against exposure as a figure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 import hsnoise
 from hsnoise.cli.progress import busy
 
-ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 have in common
+ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 share
 REPORTED_GAIN, REPORTED_READ_NOISE_E = 0.422149, 1.98
 
 
@@ -65,9 +65,10 @@ def imx541(folder: Path, figure: Path) -> None:
 
 def draw_gain(result, path: Path) -> None:
     """Local gain (excess of a level's temporal variance over its signal) of the flats against signal."""
-    flats, physics = result.summary.flats, result.physics
-    signal = flats.mean_dn[:, 0] - physics.black_level[0]
-    floor = (physics.gain[0] * physics.read_noise) ** 2 + 1 / 12
+    flats, table = result.summary.flats, result.table
+    gain, read_noise_e, black_dn = (table[name][0] for name in ("gain", "read_noise.sigma", "black_level"))
+    signal = flats.mean_dn[:, 0] - black_dn
+    floor = (gain * read_noise_e) ** 2 + 1 / 12
     local = (flats.variance_dn2[:, 0] - floor) / signal
     error = flats.variance_dn2[:, 0] * np.sqrt(2 / flats.dof[:, 0]) / signal
     fig = Figure(figsize=(7, 4.2), layout="constrained")
@@ -76,7 +77,7 @@ def draw_gain(result, path: Path) -> None:
         signal, local, 2 * error, fmt="o", color="#0072b2", capsize=3, label="each flat level, 2 standard errors"
     )
     axis.axhline(REPORTED_GAIN, color="#d55e00", ls="--", label="reported, 0.4221 DN/e-")
-    axis.axhline(physics.gain[0], color="k", lw=1, label=f"joint fit, {physics.gain[0]:.4f} DN/e-")
+    axis.axhline(gain, color="k", lw=1, label=f"joint fit, {gain:.4f} DN/e-")
     axis.axhspan(REPORTED_GAIN * 0.98, REPORTED_GAIN * 1.02, color="#d55e00", alpha=0.1, label="reported, within 2 %")
     axis.set_xscale("log")
     axis.set_xlabel("signal above black (DN)")
@@ -120,7 +121,7 @@ def stl1001(folder: Path) -> None:
 
 
 def improved(folder: Path, only: list[str]) -> None:
-    """The story of `hsnoise.improve` on the darks of each sensor, or of `only` these; on a part of a CCD's frames."""
+    """Print the story of `hsnoise.improve` on the darks of each sensor, or of `only` these; for CCDs on a part."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
     names = [name for name in data.files if name.startswith("dark")]
@@ -141,7 +142,7 @@ def improved(folder: Path, only: list[str]) -> None:
 
 
 def a7s2(folder: Path, path: Path) -> None:
-    """Mean of dark frames above black against exposure: it falls where the camera subtracts more than there is."""
+    """Mean of dark frames above black against exposure; it falls if the camera subtracts too much."""
     data = np.load(folder / "a7s2_dark_mean_ladder.npz")
     order = np.argsort(data["exposure_s"])
     exposure_s, means = data["exposure_s"][order], data["mean_minus_black_dn"][:, order]
@@ -164,7 +165,7 @@ def a7s2(folder: Path, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figure", type=Path, default=Path("docs/figures/imx541_gain.png"))
-    parser.add_argument("--improve", action="store_true", help="what the paper's model lacks in each sensor")
+    parser.add_argument("--improve", action="store_true", help="find what the paper's model lacks for each sensor")
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="SENSOR", help="with --improve: IMX541, TC-237, STL-1001"
     )

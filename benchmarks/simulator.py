@@ -1,8 +1,7 @@
-"""A simulator of dark captures with a hidden effect, in NumPy; it shares no code with hsnoise.
+"""A simulator, in NumPy, of dark captures with a hidden effect; it shares no code with hsnoise.
 
-`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]; `effect` may be a pair that acts
-together. Amplitude 1 of an effect is like that of a modest real sensor; its details (period, corner, taps) are drawn
-from `rng`.
+`capture(camera, effect, amplitude, rng)` gives counts [exposure, frame, row, column]; `effect` may be a pair.
+Amplitude 1 is typical of a modest real sensor; details (period, corner, taps) are drawn from `rng`.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ GRASSHOPPER = Camera((3.54, 3.11, 3.95), 118.0, 5.43**0.5, (0.09, 0.0069**0.5, 0
 MONO = Camera((2.1,), 80.0, 3.0, (0.12,), True, 64.0)
 CAMERAS = {"canon": CANON, "grasshopper": GRASSHOPPER, "mono": MONO}
 
-# Amplitude 1 in each effect's own measure.
+# Amplitude 1 in each effect's own unit.
 MODEST = {
     "row_noise": 1.0,  # e-
     "column_noise": 0.8,
@@ -57,7 +56,7 @@ MODEST = {
     "odd_even_pattern": 0.8,  # e-
     "tap_offsets": 0.8,  # e-
     "black_shading": 1.5,  # DN, rms
-    "missing_codes": 0.6,  # digital gain less 1
+    "missing_codes": 0.6,  # digital gain minus 1
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
     "shared_row_gain": 0.12,
     "black_clamp": 0.7,  # of the dark level
@@ -74,7 +73,7 @@ PAIRS = (
 
 
 def colour_of(shape: tuple[int, int], channels: int = 3) -> np.ndarray:
-    """Channel of each pixel of an RGGB sensor (of a mono sensor: one channel), [row, column]."""
+    """Channel of each pixel [row, column] of an RGGB sensor, or of a mono sensor with one channel."""
     if channels == 1:
         return np.zeros(shape, int)
     tile = np.array([[0, 1], [1, 2]])
@@ -112,7 +111,7 @@ def capture(
 
 
 def _size(effect: str, amplitude: float) -> float:
-    """An amplitude in the effect's own measure."""
+    """An amplitude in the effect's own unit."""
     if effect not in MODEST and effect not in ODD:
         raise ValueError(f"effect: {effect!r} is not one of {', '.join((*MODEST, *ODD))}")
     if effect == "heavy_tailed_read_noise":
@@ -122,7 +121,7 @@ def _size(effect: str, amplitude: float) -> float:
 
 
 def _static(sizes: dict[str, float], camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
-    """What stays the same in all frames of the sensor, of all effects together."""
+    """The fixed patterns of the sensor from all effects."""
     out: dict[str, np.ndarray | float] = {}
     for effect, size in sizes.items():
         for name, value in _static_of(effect, size, camera, rng, shape).items():
@@ -135,7 +134,7 @@ def _static(sizes: dict[str, float], camera: Camera, rng, shape) -> dict[str, np
 
 
 def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str, np.ndarray | float]:
-    """What stays the same in all frames of the sensor, of one effect."""
+    """The fixed patterns of the sensor from one effect."""
     rows, columns = shape
     r, c = np.mgrid[0:rows, 0:columns]
     out: dict[str, np.ndarray | float] = {}
@@ -209,7 +208,7 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     if ahead := sizes.get("readout_overshoot"):
         x[:, :, 1:] = (1 + ahead) * x[:, :, 1:] - ahead * x[:, :, :-1]
     if curvature := sizes.get("nonlinearity"):
-        x = np.minimum(x, 0.5 / curvature)  # level beyond its summit
+        x = np.minimum(x, 0.5 / curvature)  # constant beyond the maximum
         x = x - curvature * np.maximum(x, 0) ** 2
     return _digital(camera, sizes, x * hidden.get("gain", 1.0), hidden.get("black", 0.0), t, rng)
 

@@ -1,10 +1,10 @@
-"""How fast: sampling and its gradient, histograms, likelihood, fits, diagnosis, training, beside what users would
-take instead.
+"""Speed of sampling and its gradient, histograms, likelihood, fits, diagnosis and training, compared with what users
+would use instead.
 
     python -m benchmarks.speed
     python -m benchmarks.speed --only sampling,passes --rounds 3
 
-Contestants take turns, so that a busy machine slows all alike; the table gives medians. PyTorch takes part if it is
+Contestants take turns, so that a busy machine slows them equally; the table gives medians. PyTorch is included if
 installed. Growth is the slope of log time against log size.
 """
 
@@ -32,7 +32,7 @@ from hsnoise.effects import ADC
 from hsnoise.enhance.training.noisy import camera_of
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, examples
-from hsnoise.likelihood.physics import evaluate, physics_of
+from hsnoise.likelihood.darks import evaluate, likelihood_part
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.likelihood.summary import summarise, without_counts
 
@@ -43,7 +43,7 @@ READ_E, GAIN, ROW_SIGMA, DARK_E, WHITE = 3.5, 1.3, 0.2, 2.6, 16383
 
 @dataclass(frozen=True)
 class Line:
-    """A row of the report: what was measured, for whom, and the median of its rate or time."""
+    """A row of the report: what was measured, of which contestant, and its median rate or time."""
 
     part: str
     what: str
@@ -53,15 +53,15 @@ class Line:
 
 
 def model() -> hsnoise.NoiseModel:
-    """The paper's model whole, 14 bit."""
+    """The paper's complete model, 14 bits."""
     return hsnoise.cameras.canon_5d3().remove("adc").add(ADC(WHITE))
 
 
 def medians(contestants: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Median seconds a call of each, in turns, after one call that may compile.
+    """Median seconds per call of each contestant, in turns, after one call that may compile.
 
-    A turn is as many calls as fill TURN_S: after seconds of a slow contestant, the first call of the next one finds
-    its memory cold (up to twice the time, on machines that reclaim idle pages), which no user's loop does.
+    A turn lasts at least TURN_S: after seconds of a slow contestant, the next one's first call finds cold memory (up to
+    twice the time on machines that reclaim idle pages), which would not happen in a user's loop.
     """
     for run in contestants.values():
         jax.block_until_ready(run())
@@ -77,7 +77,7 @@ def medians(contestants: dict[str, Callable[[], object]], rounds: int) -> dict[s
 
 
 def threaded_numpy(mean_e, threads: int) -> Callable[[], np.ndarray]:
-    """The same model by NumPy's fastest generator, a share of the frames in each thread."""
+    """The same model with NumPy's fastest generator, a share of the frames in each thread."""
     out = np.empty((FRAMES, ROWS, COLUMNS), np.uint16)
 
     def share(i: int) -> None:
@@ -150,7 +150,7 @@ def sampling(rounds: int) -> list[Line]:
 
 
 def gradient(rounds: int) -> list[Line]:
-    """Of the mean square of 1 Mpixel of samples by all parameters."""
+    """Gradient of the mean square of 1 Mpixel of samples with respect to all parameters."""
     camera, key = model(), jax.random.key(0)
     light = jnp.full((1, ROWS, COLUMNS), 10.0)
 
@@ -179,18 +179,18 @@ def passes(rounds: int) -> list[Line]:
 
 
 def likelihood(rounds: int) -> list[Line]:
-    """A dark exposure of 32 frames of 12 Mpixel, as a fit of it asks; and of narrow rows, which tell less each."""
+    """Likelihood of 32 dark frames of 12 Mpixel as in a fit, and of narrow rows, which hold less information each."""
     return [likelihood_of(shape, rounds) for shape in ((3000, 256), (3000, 4000))]
 
 
 def likelihood_of(shape: tuple[int, int], rounds: int) -> Line:
     summary = summarise(dark_stack(32, shape, exposures=1))
     with jax.enable_x64(True):
-        physics = physics_of(model())
-        rules = jax.tree.map(jnp.asarray, plan_rules(physics, summary, CLOSE_MARGIN))
+        known = likelihood_part(model())
+        rules = jax.tree.map(jnp.asarray, plan_rules(known, summary, CLOSE_MARGIN))
         slope = eqx.filter_jit(jax.value_and_grad(evaluate))
         light = without_counts(summary)
-        times = medians({"hsnoise": lambda: slope(physics, light, rules)}, rounds)
+        times = medians({"hsnoise": lambda: slope(known, light, rules)}, rounds)
     what = f"32 frames of {shape[0]} x {shape[1]}, value and gradient"
     return Line("likelihood", what, "hsnoise", 1e3 * times["hsnoise"], "ms")
 
@@ -268,7 +268,7 @@ def diagnose(rounds: int) -> list[Line]:
 
 
 def training(rounds: int) -> list[Line]:
-    """A step of the enhancer, 16 maps, 4 x 8 frames of 32 pixels: with its noise, the noise alone, and by PyTorch."""
+    """A training step of the enhancer, 16 maps, 4 x 8 frames of 32 pixels: whole, its noise alone, and in PyTorch."""
     camera = camera_of("canon_5d3", None, None)
     trainer = Trainer(Recipe(maps=16, decay=False), 1, camera, camera.model)
     state = trainer.start(0)

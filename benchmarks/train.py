@@ -1,4 +1,4 @@
-"""Train the video enhancer: the command `hsnoise train`, which writes to build/train unless told otherwise.
+"""Train the video enhancer: the command `hsnoise train`, by default with output to build/train.
 
 python -m benchmarks.train --preset cpu --clips FOLDER
 """
@@ -11,7 +11,7 @@ from hsnoise.cli import main as cli
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command; raises SystemExit where it does not end well."""
+    """Run the command; raises SystemExit if it fails."""
     code = cli.main(["train", "--out", "build/train", *(sys.argv[1:] if argv is None else argv)])
     if code:
         sys.exit(code)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
+from hsnoise._core.naming import named
 from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
@@ -18,18 +16,20 @@ from hsnoise.fitting.notes import closing_notes, outlier_fraction
 from hsnoise.fitting.pixel_fit import measure
 from hsnoise.fitting.pixel_result import POPULATION, result_of
 from hsnoise.fitting.profile import profile_errors
-from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.mosaics import warn_of_a_mosaic
 from hsnoise.frames.source import as_stack
-from hsnoise.likelihood.coordinates import coordinates_for, labels
+from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
+from hsnoise.likelihood.darks import dark_current, flat_gain_of
 from hsnoise.likelihood.flat_gain import judged
-from hsnoise.likelihood.moments import start_physics
-from hsnoise.likelihood.physics import WITH_LIKELIHOOD, Physics, flat_gain_of
+from hsnoise.likelihood.moments import start_model
+from hsnoise.likelihood.parameters import within_bounds
 from hsnoise.likelihood.summary import Summary, far_outliers, summarise
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, part_of
+from hsnoise.simulation.draws import check_effects, check_fits
+from hsnoise.simulation.portion import Portion
 from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ
 from hsnoise.statistics.pixels.survey import Survey, survey
 
@@ -40,7 +40,6 @@ PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, that tell whether 
 SMALLEST = 8  # rows and columns; fewer tell nothing of rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")
-BASE_EFFECTS = (ShotNoise, DarkCurrent, ReadNoise, RowGain, Gain, BlackLevel, ADC)
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
     "{} lies at a step of the likelihood, where the rows whose gain the model clips at 0 are rounded to the next count:"
@@ -50,7 +49,7 @@ AT_EDGE = (
 
 def without_likelihood(model: NoiseModel) -> tuple[str, ...]:
     """The effects of a model that only simulated statistics can fit."""
-    return tuple(name for name in model.names if name not in WITH_LIKELIHOOD)
+    return tuple(effect.name for effect in model if not effect.in_likelihood)
 
 
 def fit(
@@ -99,7 +98,7 @@ def fit(
     if pixels not in PIXELS:
         raise ValueError(f"pixels: expected one of {', '.join(PIXELS)}, got {pixels!r}")
     if model is not None and not isinstance(model, NoiseModel):
-        raise TypeError(f"model: expected a NoiseModel, got {type(model).__name__}")
+        raise TypeError(f"{named('model')}: expected a NoiseModel, got {type(model).__name__}")
     source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
     if isinstance(source, Summary) and (method == "transfer" or pixels == "differ"):
         raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")
@@ -143,60 +142,58 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
-            "black_level: flats alone do not tell the black level from read noise; give black_level or add dark frames"
+            f"{named('black_level')}: flats alone do not tell the black level from read noise; give"
+            f" {named('black_level')} or add dark frames"
         )
     with jax.enable_x64(True):
-        start = start_physics(summary, with_row_gain, with_clamp)
+        start = start_model(summary, with_row_gain, with_clamp)
         summary = _with_judged_flats(summary, start)
         if model is not None and "dark_current" not in model:
-            start = eqx.tree_at(lambda p: p.dark_current, start, np.asarray(0.0))
+            start = start.remove("dark_current")
         if white_share is not None:
-            exponent = start.exponent if white_share < 1 else np.asarray(0.0)
-            start = replace(start, white_share=white_share, exponent=exponent)
+            start = start.with_value("row_gain", "white_share", white_share)
+            start = start if white_share < 1 else start.with_value("row_gain", "exponent", 0.0)
         if method == "line":
-            return _by_line(summary, model, "the paper's line fit, as asked")
+            return _by_line(summary, model, Status.LINE)
         log.info("Maximising the likelihood of rows, pixels pooled")
         # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
         outside = far_outliers(summary)
-        result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
+        result, converged = _by_likelihood(summary, model, start, _set_apart(outside))
         if (outside <= OUTLIERS_FROM).all():
             outside = outlier_fraction(result)
             if (outside > OUTLIERS_FROM).any():
-                result, converged = _by_likelihood(summary, model, _with_outliers(start, outside))
+                result, converged = _by_likelihood(summary, model, start, _set_apart(outside))
         if converged:
             return result
-        why = result.outcome.removeprefix(NOT_CONVERGED)
         if method == "ml" or with_clamp or white_share is not None:
-            raise RuntimeError(f"fit: maximum likelihood did not converge: {why}")
-        return _by_line(summary, model, f"MAXIMUM LIKELIHOOD DID NOT CONVERGE ({why}); the line fit instead")
+            raise RuntimeError(f"fit: maximum likelihood did not converge: {result.detail}")
+        return _by_line(summary, model, Status.LINE_INSTEAD, result.detail)
 
 
-def _with_judged_flats(summary: Summary, start: Physics) -> Summary:
+def _with_judged_flats(summary: Summary, start: NoiseModel) -> Summary:
     """The curve of the flats' variance and what each level weighs come before the likelihood, which is given both."""
     if summary.flats is None:
         return summary
     return replace(summary, flats=judged(summary.flats, flat_gain_of(start, summary.flats)))
 
 
-def _with_outliers(start: Physics, share: np.ndarray) -> Physics:
-    """The start with a component for outliers [exposure], if they are more than few."""
-    if (share <= OUTLIERS_FROM).all():
-        return start
-    return eqx.tree_at(lambda p: p.outliers, start, np.clip(share, OUTLIERS_FROM, 0.2), is_leaf=lambda x: x is None)
+def _set_apart(share: np.ndarray) -> np.ndarray | None:
+    """Where a component for outliers starts [exposure]; None if they are few."""
+    return None if (share <= OUTLIERS_FROM).all() else np.clip(share, OUTLIERS_FROM, 0.2)
 
 
 def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str, pixels: str, progress) -> FitResult:
     """A fit of the base effects, then of all together by simulated statistics."""
     if isinstance(stack, Summary):
         raise ValueError(f"stack: fitting {', '.join(extra)} needs the frames themselves, got a Summary of them")
-    part = part_of(stack)
-    check_effects(model, part)
+    portion = Portion.of(stack)
+    check_effects(model, portion.frames)
     log.info("Effects beyond the paper's, by simulated statistics after a fit of the others: %s", ", ".join(extra))
     bare = model
     for name in extra:
         bare = bare.remove(name)
     base = fit(stack, model=bare, method=method, pixels=pixels, progress=progress)
-    return fit_synthetic(base, part, model)
+    return fit_synthetic(base, portion, model)
 
 
 def rechecked(result: FitResult, stack) -> FitResult:
@@ -261,7 +258,7 @@ def _check_complete(model: NoiseModel) -> None:
     """Raise ValueError for a model without the effects that every fit has."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
-        raise ValueError(f"model: has no {', '.join(missing)}, without which it cannot be fitted")
+        raise ValueError(f"{named('model')}: has no {', '.join(missing)}, without which it cannot be fitted")
 
 
 def _white_share(model: NoiseModel | None) -> np.ndarray | None:
@@ -276,85 +273,86 @@ def _check_clamp(summary: Summary, method: str) -> None:
     if method == "line":
         raise ValueError("method: the line fit takes the means for the dark signal, which black_clamp hides; use ml")
     if not summary.histograms or np.ptp(summary.exposure_s) == 0:
-        raise ValueError("model: black_clamp shows in darks of two or more exposures only, which this stack has not")
+        raise ValueError(
+            f"{named('model')}: black_clamp shows in darks of two or more exposures only, which this stack has not"
+        )
 
 
-def _by_likelihood(summary: Summary, model, start: Physics) -> tuple[FitResult, bool]:
+def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tuple[FitResult, bool]:
     log.debug("Start of the likelihood: %s", start)
-    coordinates = coordinates_for(summary, start)
+    coordinates = coordinates_for(summary, start, outliers)
     maximum = maximise(coordinates, summary)
     log.info("Maximum likelihood, %d iterations: %s", maximum.iterations, maximum.outcome)
-    names = labels(coordinates, summary.channels)
     covariance = _covariance(maximum.information)
     if maximum.converged:
         deviation = np.sqrt(np.diagonal(covariance))
         grown = np.maximum(profile_errors(coordinates, maximum, summary) / deviation, 1.0)
         covariance = covariance * grown[:, None] * grown[None, :]
-        covariance = covariance + _of_hidden_dark_level(covariance, names, maximum.physics, summary)
-    edges = _edges(covariance, names, maximum.physics, summary)
+        covariance = covariance + _of_hidden_dark_level(covariance, coordinates, maximum.model, summary)
+    edges = _edges(covariance, coordinates, maximum.model, summary)
     grown = np.where(edges, EDGE_DN / np.sqrt(np.diagonal(covariance)), 1.0)
     covariance = covariance * grown[:, None] * grown[None, :]
-    kept = [i for i, name in enumerate(names) if not name.startswith("outliers")]  # shares of outliers are nuisances
+    kept = [i for i, number in enumerate(coordinates.numbers) if not number.is_nuisance]
     result = FitResult(
-        params=_model_with(maximum.physics, summary, model),
-        physics=jax.tree.map(np.asarray, maximum.physics),
-        names=tuple(names[i] for i in kept),
+        params=_fitted(maximum.model, model, start.exposure_s),
+        outliers=maximum.outliers,
+        names=tuple(coordinates.names[i] for i in kept),
         covariance=covariance[np.ix_(kept, kept)],
-        method="ml",
-        outcome=("converged: " if maximum.converged else NOT_CONVERGED) + maximum.outcome,
+        method=Method.ML,
+        status=Status.CONVERGED if maximum.converged else Status.NOT_CONVERGED,
+        detail=maximum.outcome,
         iterations=maximum.iterations,
         log_likelihood=maximum.log_likelihood,
         notes=(),
         summary=summary,
     )
-    at_edges = tuple(AT_EDGE.format(name) for name, edge in zip(names, edges, strict=True) if edge)
+    at_edges = tuple(AT_EDGE.format(name) for name, edge in zip(coordinates.names, edges, strict=True) if edge)
     return result.with_notes((*at_edges, *closing_notes(result))), maximum.converged
 
 
-def _edges(covariance: np.ndarray, names, physics: Physics, summary: Summary) -> np.ndarray:
+def _edges(covariance: np.ndarray, coordinates: Coordinates, found: NoiseModel, summary: Summary) -> np.ndarray:
     """Which parameters are black levels that seem better known than the mean of all pixels tells them [parameter].
 
     Rows whose gain the model clips at 0 put all their pixels on one count, and the likelihood jumps where the black
     level would be rounded to another: close to such a step its curvature says nothing of the error.
     """
-    edges = np.zeros(len(names), bool)
-    for h, gain in zip(summary.histograms, np.broadcast_to(physics.gain, len(summary.histograms)), strict=True):
-        name = "black_level" if h.channel == "mono" else f"black_level.{h.channel}"
-        noise_dn = float(gain * physics.read_noise)
-        if name in names and noise_dn > EDGE_DN:  # finer noise does tell where the steps are
-            i = names.index(name)
-            edges[i] = np.sqrt(covariance[i, i]) < 0.3 * noise_dn / np.sqrt(h.row_pixels.sum())
+    edges = np.zeros(len(coordinates.numbers), bool)
+    for i in np.flatnonzero(coordinates.where("black_level")):
+        (c,) = coordinates.numbers[i].index
+        noise_dn = float(found["gain"].value[c] * found["read_noise"].sigma)
+        if noise_dn > EDGE_DN:  # finer noise does tell where the steps are
+            pixels = summary.histograms[c].row_pixels.sum()
+            edges[i] = np.sqrt(covariance[i, i]) < 0.3 * noise_dn / np.sqrt(pixels)
     return edges
 
 
-def _of_hidden_dark_level(covariance: np.ndarray, names, physics: Physics, summary: Summary) -> np.ndarray:
+def _of_hidden_dark_level(
+    covariance: np.ndarray, coordinates: Coordinates, found: NoiseModel, summary: Summary
+) -> np.ndarray:
     """Covariance of black levels from a dark current within its error of 0.
 
     What of the mean is black and what is dark signal is open there, and curvature, at the floor, does not see it.
     """
-    moved = np.zeros(len(names))
-    blacks = [i for i, name in enumerate(names) if name.startswith("black_level")]
-    if blacks and "dark_current.rate" in names and len(summary.exposure_s):
-        i = names.index("dark_current.rate")
-        error = float(np.sqrt(covariance[i, i]))
-        if np.isfinite(error) and physics.dark_current < error:
-            gain = np.hypot(np.asarray(physics.gain), np.sqrt(np.diagonal(covariance)[: np.size(physics.gain)]))
+    deviation, moved = np.sqrt(np.diagonal(covariance)), np.zeros(len(covariance))
+    blacks, gains = coordinates.where("black_level"), coordinates.where("gain")
+    for error in deviation[coordinates.where("dark_current")]:
+        if blacks.any() and np.isfinite(error) and dark_current(found) < error:
+            gain = np.hypot(found["gain"].value, deviation[gains])
             moved[blacks] = gain * summary.exposure_s.min() * error
     return np.outer(moved, moved)
 
 
-def _by_line(summary: Summary, model, outcome: str) -> FitResult:
-    log.info("Line fit: %s", outcome)
+def _by_line(summary: Summary, model, status: Status, detail: str = "") -> FitResult:
+    log.info("Line fit: %s", status)
     line = line_fit(summary)
-    coordinates = coordinates_for(summary, line.physics)
-    errors = np.asarray(coordinates.flat(jax.tree.map(jnp.asarray, line.standard_errors)))
+    names = coordinates_for(summary, line.params).names
     result = FitResult(
-        params=_model_with(line.physics, summary, model),
-        physics=jax.tree.map(np.asarray, line.physics),
-        names=labels(coordinates, summary.channels),
-        covariance=np.diag(errors**2),
-        method="line",
-        outcome=outcome,
+        params=_fitted(line.params, model, line.params.exposure_s),
+        names=names,
+        covariance=np.diag([line.standard_errors[name] ** 2 for name in names]),
+        method=Method.LINE,
+        status=status,
+        detail=detail,
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),
@@ -371,24 +369,7 @@ def _covariance(information: np.ndarray) -> np.ndarray:
     return scale[:, None] * (vectors / eigenvalues) @ vectors.T * scale[None, :]
 
 
-def _model_with(physics: Physics, summary: Summary, model: NoiseModel | None) -> NoiseModel:
-    """A NoiseModel of the fitted values; its default exposure is the median one of the darks."""
-    white_share = 0.0 if physics.white_share is None else physics.white_share
-    values = {
-        "dark_current": lambda: DarkCurrent(physics.dark_current),
-        "read_noise": lambda: ReadNoise(physics.read_noise),
-        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent, white_share),
-        "gain": lambda: Gain(physics.gain),
-        "black_level": lambda: BlackLevel(physics.black_level),
-        "black_clamp": lambda: BlackClamp(jnp.maximum(physics.black_clamp, 0.0)),
-        "shot_noise": ShotNoise,
-        "adc": lambda: ADC(summary.white_level_dn),
-    }
-    names = [effect.name for effect in BASE_EFFECTS] if model is None else list(model.names)
-    exposures = summary.exposure_s if len(summary.exposure_s) else summary.flats.exposure_s
-    return NoiseModel(
-        [values[name]() for name in names],
-        cfa=summary.cfa,
-        shutter=summary.shutter,
-        exposure_s=float(np.sort(exposures)[len(exposures) // 2]),
-    )
+def _fitted(found: NoiseModel, model: NoiseModel | None, exposure_s: float) -> NoiseModel:
+    """What was found of the effects that are wanted (None: of all)."""
+    wanted = [found[name] for name in (found.names if model is None else model.names)]
+    return within_bounds(NoiseModel(wanted, cfa=found.cfa, shutter=found.shutter, exposure_s=exposure_s))

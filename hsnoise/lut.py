@@ -1,8 +1,8 @@
-"""Clip correction: from the mean and variance of clipped, rounded counts to those of the electrons behind them.
+"""Clip correction: from the mean and variance of clipped, rounded counts to those before clipping.
 
-The paper corrects its calibration through two 2-D tables made from Poisson + Gaussian samples. Here they are
-computed. Poisson + Gaussian is a family of three parameters, two moments determine two: a table holds for one gain,
-which the line fit iterates (line.py). Means are relative to black.
+The paper corrects its calibration by two 2-D tables made from Poisson + Gaussian samples; here they are computed.
+Poisson + Gaussian has three parameters and two moments determine two, so a table holds for one gain, over which the
+line fit (`fitting/line.py`) iterates. Means are relative to black.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from jax.scipy.special import gammaln, ndtr
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-LARGEST_SUM_E, TERMS = 30.0, 92  # sum over photoelectrons: 9 standard deviations and a few at this mean
+LARGEST_SUM_E, TERMS = 30.0, 92  # sum over photoelectrons: 9 standard deviations above this mean, and some
 NARROW_DN, NARROW_TERMS = 0.85, 11  # read noise below which rounding is summed count by count
-LEAST_READ_VARIANCE_DN2 = 0.1  # below it rounding of single electrons' peaks folds the map
+LEAST_READ_VARIANCE_DN2 = 0.1  # below it, rounding of single electrons' peaks makes the map fold over
 NEWTON_STEPS, NEWTON_TOLERANCE = 25, 1e-10
 LEAST_VECTOR = 256  # points evaluated at once
-CLEAR = 8.0  # standard deviations from clipping at which nothing is clipped
+CLEAR = 8.0  # standard deviations from the clipping level at which nothing is clipped
 LEAST_RATIO = 0.15  # smallest clipped mean above the clipping level in the tables, in standard deviations
 
 
 class Unclipped(NamedTuple):
-    """True mean (DN above black), true variance (DN^2), and whether a law of the family has the clipped moments."""
+    """True mean (DN above black), true variance (DN^2), and whether some distribution has these clipped moments."""
 
     mean_dn: Array
     variance_dn2: Array
@@ -47,9 +47,8 @@ def clipped_moments(
 
     P is Poisson, R normal, with `mean_dn` = gain E[P] and `variance_dn2` = gain^2 (E[P] + Var[R]); all arguments but
     the white level broadcast. Exact (above 30 e- to the third cumulant of P): given P, the clipped and rounded normal
-    has closed moments. Where there is no such law a neighbour is taken, so that both moments stay continuous: a mean
-    below black is that of a normal; a variance that leaves less than 0.1 DN^2 to read noise is shot noise of a
-    lower gain.
+    has closed moments. Where no such distribution exists, the moments are continued: a mean below black is that of a
+    normal; a variance that leaves less than 0.1 DN^2 to read noise is shot noise of a lower gain.
     """
     with jax.enable_x64(True):
         return _pointwise(_moments, (mean_dn, variance_dn2, gain, black_level_dn), white_level_dn)
@@ -65,9 +64,9 @@ def unclip(
 ) -> Unclipped:
     """Inverse of `clipped_moments`, by Newton's method; differentiable.
 
-    `solved` is false where no Poisson + normal law of this gain has the pair: a mean below that of counts at black,
-    a variance below that of shot noise. There the continuation of `clipped_moments` is returned, or, where even
-    that has no solution (no whole numbers have the pair), the pair itself.
+    `solved` is false where no Poisson + normal distribution of this gain has the pair: a mean below that of counts at
+    black, or a variance below that of shot noise. Then the continuation of `clipped_moments` is inverted, or, if that
+    has no solution either (no whole numbers have the pair), the pair itself is returned.
 
     Args:
         mean_dn: mean of the clipped counts, DN above black.
@@ -89,10 +88,10 @@ def row_moments(
     black_level_dn: ArrayLike = 0.0,
     white_level_dn: float | None = None,
 ) -> tuple[Array, Array, Array]:
-    """What gains beta of rows, beta = max(Normal(1, row_sigma^2), 0), make of `clipped_moments` (arguments as there).
+    """`clipped_moments` (same arguments) under row gains beta = max(Normal(1, row_sigma^2), 0).
 
     Returns the mean over rows of their means (DN above black), the mean of their variances (DN^2), and the standard
-    deviation of their means over `row_sigma` (DN; far from clipping, or where black is the clipping level, the mean).
+    deviation of their means divided by `row_sigma` (DN; equal to the mean far from clipping, or if black is 0).
     """
     with jax.enable_x64(True):
         mean, variance, sigma, gain, black = _broadcast(mean_dn, variance_dn2, row_sigma, gain, black_level_dn)
@@ -116,7 +115,7 @@ def _broadcast(*arrays):
 
 
 def _pointwise(function, arguments, white):
-    """Apply a function of vectors to arrays; vectors are padded to a power of two, which spares compilations."""
+    """Apply a function of vectors to arrays; vectors are padded to a power of two to save compilations."""
     arguments = _broadcast(*arguments)
     shape, size = arguments[0].shape, arguments[0].size
     padding = max(1 << (size - 1).bit_length(), LEAST_VECTOR) - size
@@ -127,8 +126,8 @@ def _pointwise(function, arguments, white):
 def _photoelectrons(mean_e):
     """Numbers of photoelectrons and their probabilities [point, term], and a normal variance to add [point].
 
-    Up to a mean of 30 e- the Poisson law itself; above, one of mean 30 e-, stretched, and a normal that together
-    have its mean, variance and third cumulant (kurtosis too large by less than 0.005).
+    Up to a mean of 30 e- the exact Poisson distribution. Above, a stretched Poisson of mean 30 e- and a normal that
+    together have the same mean, variance and third cumulant (kurtosis too large by less than 0.005).
     """
     few = jnp.minimum(mean_e, LARGEST_SUM_E)
     stretch = jnp.cbrt(jnp.maximum(mean_e, LARGEST_SUM_E) / LARGEST_SUM_E)
@@ -141,8 +140,8 @@ def _photoelectrons(mean_e):
 def _rectified(mu, s):
     """Mean and mean square of max(round(X), 0), X ~ Normal(mu, s^2), elementwise.
 
-    Both are sums over counts j >= 1: of P(X > j - 1/2), and of (2j - 1) P(X > j - 1/2). Where s spans counts the
-    Euler-Maclaurin formula of the midpoint rule, else the terms that are neither 0 nor 1.
+    They are sums over counts j >= 1 of P(X > j - 1/2) and of (2j - 1) P(X > j - 1/2). If s spans counts, the
+    Euler-Maclaurin formula of the midpoint rule is used; otherwise the terms that are neither 0 nor 1.
     """
 
     def wide(mu, s):
@@ -207,9 +206,9 @@ def _unclip(mean, variance, gain, black, white):
     fixed, one = jax.lax.stop_gradient((mean, variance, gain, black)), jnp.ones_like(mean)
     start = (0, *_start(*fixed[:2], fixed[3], white), jnp.inf * one, (one, one, one, one))
     _, x, y, error, (a, b, c, d) = jax.lax.while_loop(unsettled, newton, start)
-    # One more step, with derivatives by the arguments: those of the implicit function.
+    # One more step gives the derivatives with respect to the arguments: those of the implicit function.
     rx, ry = residual(x, y, mean, variance, gain, black)
-    # Where rounding folds the map, near pure shot noise of about 1 DN, the root on the reversed side is none.
+    # Where rounding folds the map, near pure shot noise of about 1 DN, the root on the reversed side is invalid.
     found = (error < 1e-6) & (a * d > b * c)
     true_mean = jnp.where(found, x - a * rx - b * ry, mean)
     true_variance = jnp.where(found, jnp.exp(y - c * rx - d * ry), variance)
@@ -217,7 +216,7 @@ def _unclip(mean, variance, gain, black, white):
 
 
 def _start(mean, variance, black, white):
-    """Where Newton's method starts: the true mean and log variance of a clipped normal, to 20 %."""
+    """Starting point of Newton's method: the true mean and log variance of a clipped normal, to 20 %."""
     spread = jnp.sqrt(variance)
     ratio = (mean + black) / spread
     towards: ArrayLike = -1.0
@@ -230,7 +229,7 @@ def _start(mean, variance, black, white):
 
 
 def _is_law(mean, variance, gain):
-    """Whether a mean and a variance leave a Poisson mean and a read-noise variance that are not negative."""
+    """Whether a mean and a variance imply a non-negative Poisson mean and read-noise variance."""
     slack = 1e-9 * jnp.sqrt(variance)
     return (mean >= -slack) & (variance - gain * mean >= -gain * slack)
 
@@ -238,15 +237,15 @@ def _is_law(mean, variance, gain):
 class ClipTables(eqx.Module):
     """Two tables of clip correction at one gain: (clipped mean, clipped variance) -> (true mean, true variance).
 
-    Nodes are even in the log of the clipped variance and in nearness, the log of the distance of the clipped mean
-    from the nearer clipping level over CLEAR standard deviations: 0 where nothing is clipped, negative near
-    black, positive near white. Tabulated are corrections, which vanish far from clipping (but for the 1/12 DN^2 of
-    rounding): (true - clipped mean) / clipped standard deviation, and log(true / clipped variance).
+    Nodes are evenly spaced in the log of the clipped variance and in nearness: the log of the distance of the clipped
+    mean from the nearer clipping level over CLEAR standard deviations. It is 0 where nothing is clipped, negative near
+    black, positive near white. The tables hold corrections, which vanish far from clipping (except for the 1/12 DN^2
+    of rounding): (true - clipped mean) / clipped standard deviation, and log(true / clipped variance).
 
     Attributes:
         log_variance, nearness: nodes [variance], [nearness].
         mean_shift, log_growth: corrections [variance, nearness].
-        found: nodes [variance, nearness] that some law, also one of the continuation of `clipped_moments`, has.
+        found: whether a distribution, or the continuation of `clipped_moments`, has the node [variance, nearness].
         gain, black_level_dn, white_level_dn: DN/e-, and DN above the clipping level.
     """
 
@@ -260,10 +259,10 @@ class ClipTables(eqx.Module):
     white_level_dn: float | None
 
     def __call__(self, mean_dn: ArrayLike, variance_dn2: ArrayLike) -> Unclipped:
-        """True moments of clipped ones, by monotone cubic interpolation; arguments broadcast.
+        """True moments from clipped ones, by monotone cubic interpolation; arguments broadcast.
 
-        `solved` is false, and the pair comes back as it is, outside the tables and beside nodes that no law has;
-        false, too, where the interpolated law is not one of this gain (see `unclip`).
+        Outside the tables and next to nodes not found, the pair is returned unchanged and `solved` is false. It is also
+        false where the interpolated moments belong to no distribution of this gain (see `unclip`).
         """
         mean, variance = jnp.broadcast_arrays(jnp.asarray(mean_dn, float), jnp.asarray(variance_dn2, float))
         x = _position(self.log_variance, jnp.log(variance))
@@ -299,7 +298,7 @@ def make_clip_tables(
         nodes: number of nodes along the variance, and along the nearness to each clipping level.
 
     Raises:
-        ValueError: for a gain or variances that are not positive, a white level not above black, or fewer than
+        ValueError: a gain or variances that are not positive, a white level not above black, or fewer than
             4 nodes.
     """
     low, high = variance_dn2
@@ -329,7 +328,7 @@ def _columns(variance, gain, black, white, nearness):
     """Corrections and whether they were found, each [variance, nearness]."""
     blocks = []
     with jax.enable_x64(True):
-        # In blocks, since the iteration ends early where nothing is clipped.
+        # In blocks, because the iteration ends early where nothing is clipped.
         for y in np.array_split(nearness, -(-len(nearness) * len(variance) // LEAST_VECTOR)):
             mean = _mean_at(y[None, :], variance[:, None], black, white)
             m, v, _, found = _pointwise(_unclip, (mean, variance[:, None], gain, black), white)
@@ -338,7 +337,7 @@ def _columns(variance, gain, black, white, nearness):
 
 
 def _clearance(variance, white):
-    """Distance from clipping at which nearness is 0, DN: less than CLEAR deviations where counts span both ends."""
+    """Distance from clipping at which nearness is 0, DN: below CLEAR deviations if counts span both ends."""
     clear = CLEAR * variance**0.5
     return clear if white is None else jnp.minimum(clear, white / 2)
 
@@ -366,7 +365,7 @@ def _interpolate(table, i, j, s, t):
 
 
 def _monotone_cubic(f, t):
-    """Between f[1] and f[2] of four even nodes, without overshoot (Steffen, Astron. Astrophys. 239, 443, 1990)."""
+    """Value between f[1] and f[2] of four even nodes, no overshoot (Steffen, Astron. Astrophys. 239, 443, 1990)."""
     before, rise, after = f[1] - f[0], f[2] - f[1], f[3] - f[2]
 
     def slope(a, b):

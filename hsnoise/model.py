@@ -1,4 +1,4 @@
-"""The noise model: an ordered set of effects; sampling frames from it; its file."""
+"""The noise model, an ordered set of effects: sampling frames from it, saving and loading it."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 
 
 class NoiseModel(eqx.Module):
-    """What a sensor does to light: effects in the order of their stages, then of insertion.
+    """The effects of a sensor on light, in the order of their stages, then of insertion.
 
     A PyTree whose leaves are the physical parameters. `model["gain"].value` is the gain, `model.add(effect)`
-    a larger model, `model.table` all numbers with their units.
+    a larger model, `model.table` holds all numbers with their units.
 
     Attributes:
         effects: the effects, in the order in which they act.
         cfa: "mono" or a 2x2 Bayer string.
         shutter: "rolling" or "global".
-        exposure_s: exposure in seconds that `sample` takes unless told otherwise.
+        exposure_s: default exposure of `sample`, in seconds.
     """
 
     effects: tuple[AbstractEffect, ...]
@@ -57,9 +57,9 @@ class NoiseModel(eqx.Module):
         """Make a model of `effects`, in any order.
 
         Raises:
-            TypeError: if something among `effects` is no effect.
-            ValueError: on two effects of one name, a parameter that does not fit the channels of `cfa`, an
-                unknown `cfa` or `shutter`, a negative `exposure_s`.
+            TypeError: if `effects` contains anything but effects.
+            ValueError: for two effects of one name, a parameter that does not fit the channels of `cfa`, an
+                unknown `cfa` or `shutter`, or a negative `exposure_s`.
         """
         effects = tuple(effects)
         for effect in effects:
@@ -68,7 +68,7 @@ class NoiseModel(eqx.Module):
         names = [effect.name for effect in effects]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"effects: {', '.join(twice)} given twice; a model holds one effect of a name.")
+            raise ValueError(f"effects: {', '.join(twice)} given twice; a model holds one effect per name.")
         check_shutter(shutter)
         channels = channels_of(cfa)
         ordered = sorted(effects, key=lambda effect: effect.acts_at)
@@ -100,9 +100,9 @@ class NoiseModel(eqx.Module):
         return iter(self.effects)
 
     def add(self, effect: AbstractEffect) -> NoiseModel:
-        """The model with one effect more, or with this one in place of its own of that class.
+        """The model with `effect` added, or in place of the model's effect of that class.
 
-        Raises ValueError if it has one of that name of another class.
+        Raises ValueError if the model has an effect of that name but of another class.
         """
         return self._with((*(own for own in self.effects if type(own) is not type(effect)), effect))
 
@@ -114,8 +114,8 @@ class NoiseModel(eqx.Module):
     def with_value(self, name: str, field: str, value: ArrayLike) -> NoiseModel:
         """The model with another value of one parameter, such as `model.with_value("gain", "value", 2.0)`.
 
-        Raises KeyError for an effect that it has not, ValueError for a parameter that the effect has not, and for a
-        value outside its bounds or that does not fit the channels, TypeError for what is no number.
+        Raises KeyError for an unknown effect, ValueError for an unknown parameter and for a value outside its bounds or
+        that does not fit the channels, TypeError for anything but numbers.
         """
         old = self[name]
         if field not in old.specs():
@@ -140,7 +140,7 @@ class NoiseModel(eqx.Module):
         return f"NoiseModel of {', '.join(self.names)}; {self.cfa}, {self.shutter} shutter, {self.exposure_s:g} s"
 
     def _shown(self) -> list[tuple[str, str, str]]:
-        """Names, values and units of parameters and of what was chosen; none of a model without numbers."""
+        """Names, values and units of parameters and settings; empty for a model without numbers."""
         rows = []
         for effect in self.effects:
             try:
@@ -158,8 +158,8 @@ class NoiseModel(eqx.Module):
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
-        """Parameter name to (value, standard error, unit) as in the table of a fit, such as {"gain.R": (1.53, nan,
-        "DN/e-"), ...}; the error is NaN throughout: a model states none."""
+        """Parameter name to (value, standard error, unit), as in the table of a fit, such as {"gain.R": (1.53, nan,
+        "DN/e-"), ...}; all errors are NaN, because a model states none."""
         return {p.name: (p.value, math.nan, p.spec.unit) for p in self.parameters()}
 
     def to_pandas(self) -> Any:
@@ -196,10 +196,10 @@ class NoiseModel(eqx.Module):
 
         Args:
             path: the file.
-            effects: classes of the effects in it that are not built into hsnoise.
+            effects: classes of its effects that are not built into hsnoise.
 
         Raises:
-            ValueError: if the file is no noise model or holds an effect, parameter or unit that is not known.
+            ValueError: if the file is not a noise model or holds an unknown effect, parameter or unit.
         """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -237,33 +237,32 @@ def sample(
     window: tuple[Any, Any, int, int] | None = None,
     differentiable: bool = False,
 ) -> Array:
-    """Draw what the sensor makes of a clean image: counts in DN.
+    """Draw noisy frames of a clean image: counts in DN.
 
-    Every leading index of `clean` is a frame of its own, with its own row gains. Each effect draws from a key
-    that is named after it, so adding an effect leaves the draws of the others as they were. Works under jit
-    and vmap.
+    Every leading index of `clean` is a separate frame with its own row gains. Each effect draws from a key named
+    after it, so adding an effect does not change the draws of the others. Works under jit and vmap.
 
     Args:
-        key: a random key, or a whole number from 0 to 2^32 - 1, its seed: 7 stands for `jax.random.key(7)`.
+        key: a random key, or its seed, a whole number from 0 to 2^32 - 1: 7 means `jax.random.key(7)`.
         clean: expected photoelectrons of each pixel, e-, [..., row, column]; zeros give dark frames.
         params: the noise model.
-        exposure_s: exposure in seconds; that of the model by default.
-        sensor_key: key, or seed, from which fixed patterns are drawn; the same key is the same sensor. By default
-            derived from `key`, so that each call is another sensor of the same make.
-        window: (first row, first column, rows, columns) where the frames are a piece of a larger sensor, for effects
+        exposure_s: exposure in seconds; default: that of the model.
+        sensor_key: key or seed of the fixed patterns; the same key is the same sensor. By default derived from `key`,
+            so that each call is another sensor of the same make.
+        window: (first row, first column, rows, columns) if the frames are a piece of a larger sensor, for effects
             that depend on the place (glow, taps, shading); under jit the first two may be traced. Row gains and row
             noise run over the rows of the piece.
-        differentiable: the same counts as floats, with derivatives by `clean` and the parameters. Clipping stops
-            them, rounding does not. The derivatives by light and dark current need read noise, with nothing but
-            effects that add electrons before it.
+        differentiable: return the same counts as floats, with derivatives with respect to `clean` and the parameters.
+            Clipping stops gradients, rounding does not. Derivatives with respect to light and dark current need read
+            noise, preceded only by effects that add electrons.
 
     Returns:
-        Counts, the shape of `clean`: uint16 if the model's white level is at most 65535 DN, else uint32.
-        Without the `adc` effect (`params.remove("adc")`): DN as floats, neither rounded nor clipped.
+        Counts of the shape of `clean`: uint16 if the model's white level is at most 65535 DN, else uint32.
+        Without the `adc` effect (`params.remove("adc")`), DN as floats, neither rounded nor clipped.
 
     Raises:
-        TypeError: if `params` is no NoiseModel, a key is neither a random key nor a whole number, or `clean` does not
-            hold real numbers.
+        TypeError: if `params` is not a NoiseModel, a key is neither a random key nor a whole number, or `clean` does
+            not hold real numbers.
         ValueError: if `clean` has fewer than two dimensions, no pixels, odd sizes with a Bayer array, or
             negative or non-finite values; if the exposure is negative or not one number; if a seed is out of range;
             if the window does not hold the frames. (Under jit, values cannot be checked.)
@@ -293,7 +292,7 @@ def sample_dark(
 ) -> Array:
     """Draw `n_frames` dark frames of `shape` (rows, columns): counts in DN, [frame, row, column]. See `sample`.
 
-    Raises TypeError, ValueError as `sample`, and for a number of frames or a shape that is none.
+    Raises TypeError, ValueError as `sample`, and for an invalid number of frames or shape.
     """
     n_frames = whole_number("n_frames", n_frames, 1)
     if not isinstance(shape, tuple | list) or len(shape) != 2:
@@ -312,9 +311,9 @@ def sample_by_effect(
     sensor_key: RandomKey,
     window: Window | None = None,
 ) -> Array:
-    """As `sample` of [frame, row, column], the same counts up to rounding, but each effect is compiled by itself.
+    """As `sample` for [frame, row, column], the same counts up to rounding, but each effect is compiled separately.
 
-    Somewhat slower to run; but of a model with one effect more, only that effect is compiled.
+    It runs somewhat slower, but after adding an effect to a model, only that effect is compiled.
     window: as in FrameStack, where the frames lie on a larger sensor.
     """
     return apply_by_effect(*_prepared(key, clean, params, exposure_s, sensor_key, window))
@@ -323,7 +322,7 @@ def sample_by_effect(
 def dark_signals(
     key: RandomKey, n_frames: int, shape: tuple[int, int], params: NoiseModel, *, exposure_s: float | Scalar
 ) -> Iterator[tuple[AbstractEffect, Array]]:
-    """What leaves each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
+    """The signal after each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
     return signals(*_prepared(key, clean, params, exposure_s, None))
 
@@ -338,7 +337,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     clean, low, high = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
     effects = merged(params.effects, _regime(low, high, params, exposure))
-    # A fit returns float64 parameters, whatever precision the session samples in.
+    # A fit's parameters are always float64; sampling uses the session's precision.
     numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
     numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
     effects = eqx.combine(numbers, rest)
@@ -357,7 +356,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
 
 
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
-    """What is known of the mean electrons where light, between `low` and `high`, has not been changed before."""
+    """The known range of mean electrons if no effect has changed the light, between `low` and `high`, before."""
     rate = params["dark_current"].rate if "dark_current" in params else 0.0
     changed = any(effect.acts_at < Stage.PHOTONS or may_scale("dark_current_scale", effect) for effect in params)
     if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
@@ -367,7 +366,7 @@ def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
 
 
 def _fit_to_channels(effect: AbstractEffect, channels: tuple[str, ...]) -> AbstractEffect:
-    """Spread scalars of per-channel parameters over the channels; refuse any other shape but [channel]."""
+    """Broadcast scalars of per-channel parameters to the channels; reject any other shape but [channel]."""
     for field, spec in effect.specs().items():
         value = getattr(effect, field)
         shape = (len(channels),) if spec.per_channel else ()

@@ -1,7 +1,7 @@
 """The video enhancer: a recurrent network of spatio-temporal LSTM layers, trained on noise that hsnoise draws.
 
-Frames go in one by one and come out enhanced; what earlier frames told is kept in a state of constant size. Arrays are
-[batch, row, column, map]; a frame may also come without its batch.
+Frames go in one by one and come out enhanced; a state of constant size carries the memory of earlier frames. Arrays are
+[batch, row, column, map]; a frame may lack the batch axis.
 
 Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019 (network and
 loss); Wang, Long, Wang, Gao, Yu, "PredRNN: recurrent neural networks for predictive learning using spatiotemporal
@@ -23,7 +23,7 @@ from hsnoise._core.types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 FORGET_BIAS = 1.0
-REACH = 16  # blocks beyond a tile that the network looks at
+REACH = 16  # blocks beyond a tile that the network sees
 L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equation 10
 
 
@@ -31,7 +31,7 @@ L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equatio
 def convolve(x: jax.Array, weight: jax.Array) -> jax.Array:
     """Convolution of x [batch, row, column, in] with weight [row, column, in, out], same size, zeros outside.
 
-    Its derivative by the weight is a sum of matrix products, one for each place in the kernel: XLA's own, a
+    Its derivative with respect to the weight is a sum of matrix products, one per kernel element. XLA's own, a
     convolution with a kernel as large as the image, is ten times slower inside loops on a CPU.
     """
     return jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=LAYOUT)
@@ -78,7 +78,7 @@ class Convolution(eqx.Module):
 
 
 class Cell(eqx.Module):
-    """One ST-LSTM layer: cell C stays in the layer from frame to frame, memory M comes from the layer below."""
+    """One ST-LSTM layer: cell C stays in the layer between frames, memory M comes from the layer below."""
 
     of_input: Convolution
     of_hidden: Convolution
@@ -111,9 +111,9 @@ class Cell(eqx.Module):
 
 
 class State(eqx.Module):
-    """What the network remembers: hidden and cell of each layer, and the memory that the top layer hands on.
+    """The network's memory: hidden and cell of each layer, and the memory that the top layer passes on.
 
-    All are [batch, row, column, map], rows and columns those of the features.
+    All are [batch, row, column, map], with the rows and columns of the features.
     """
 
     hidden: tuple[jax.Array, ...]
@@ -124,8 +124,8 @@ class State(eqx.Module):
 class STLSTM(eqx.Module):
     """The enhancer: features of blocks of stride x stride pixels, ST-LSTM layers, and a convolution back to pixels.
 
-    The features are added on the way out. Frames come in as linear light, in which noise averages out, and leave as
-    display values, in which errors look as large as they are.
+    A skip connection adds the features to the last layer. Frames come in as linear light, in which noise averages out,
+    and leave as display values, in which errors look as large as they are.
 
     Attributes:
         stride: side of the blocks; kernels: kernel size of each layer; maps: feature maps; channels: of a frame.
@@ -151,15 +151,15 @@ class STLSTM(eqx.Module):
         """Make an untrained network, its weights drawn from `key`: a random key, or a whole number as its seed.
 
         Raises:
-            ValueError: for sizes below 1, even kernels or a seed out of range, TypeError for what is no whole number,
-                or no random key.
+            ValueError: sizes below 1, even kernels or a seed out of range.
+            TypeError: sizes that are not whole numbers, or a key that is neither a random key nor a whole number.
         """
         key = key_of("key", key)
         for name, value in {"maps": maps, "stride": stride, "channels": channels}.items():
             whole_number(name, value, 1)
-        kernels = listed("kernels", kernels, "odd sizes, one a layer")
+        kernels = listed("kernels", kernels, "odd sizes, one per layer")
         if not kernels or any(whole_number("kernels", kernel, 1) % 2 == 0 for kernel in kernels):
-            raise ValueError(f"kernels: expected odd sizes, one a layer, got {kernels}")
+            raise ValueError(f"kernels: expected odd sizes, one per layer, got {kernels}")
         first, last, *rest = jax.random.split(key, 2 + len(kernels))
         self.features = Convolution(first, 3, channels * stride**2, maps)
         self.cells = tuple(Cell(key, kernel, maps) for key, kernel in zip(rest, kernels, strict=True))
@@ -177,10 +177,10 @@ class STLSTM(eqx.Module):
 
         Args:
             frame: linear light, white is 1, [row, column, channel] or [batch, row, column, channel], of any size.
-            state: from `init_state` of this size, or after the frame before.
+            state: from `init_state` for this size, or from the previous frame.
 
         Raises:
-            ValueError: for a frame of other channels, or of another size or batch than the state.
+            ValueError: a frame with other channels, or of another size or batch than the state.
         """
         frame = jnp.asarray(frame, self.features.weight.dtype)
         single = frame.ndim == 3
@@ -189,7 +189,7 @@ class STLSTM(eqx.Module):
         rows, columns = frames.shape[1:3]
         missing = [(-n) % self.stride for n in (rows, columns)]
         padded = jnp.pad(frames, ((0, 0), (0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
-        features = self.features(to_blocks(jnp.arcsinh(padded), self.stride))  # a dim frame's noise is several whites
+        features = self.features(to_blocks(jnp.arcsinh(padded), self.stride))  # noise may be several times white
         x, memory, hidden, cell = features, state.memory, [], []
         for layer, h, c in zip(self.cells, state.hidden, state.cell, strict=True):
             x, c, memory = layer(x, h, c, memory)
@@ -204,14 +204,14 @@ class STLSTM(eqx.Module):
         expected = (len(frames), *(-(-n // self.stride) for n in frames.shape[1:3]))
         if state.memory.shape[:3] != expected:
             raise ValueError(
-                f"state: made for a batch, rows and columns of features of {state.memory.shape[:3]}, the frame needs"
+                f"state: made for features of batch, rows and columns {state.memory.shape[:3]}, the frame needs"
                 f" {expected}; make one with init_state"
             )
 
     def video(self, frames: jax.Array, *, checkpoint: bool = False) -> jax.Array:
         """All frames [time, batch, row, column, channel], enhanced one after the other from an empty state.
 
-        checkpoint: forget what happens inside a frame and compute it again for the gradient, in a third of the memory.
+        checkpoint: recompute the inside of each frame for the gradient, which takes a third of the memory.
         """
         step = jax.checkpoint(_step) if checkpoint else _step
         state = self.init_state(frames.shape[2:4], frames.shape[1])
@@ -245,13 +245,13 @@ def enhance(
 
     Args:
         net: the network; frames: [row, column, channel], linear light, one after the other.
-        tile: side of the tiles into which large frames are cut, pixels; None: whole frames. The result is that of
-            whole frames wherever the network does not look further than `margin` pixels beyond a tile.
-        margin: pixels that tiles overlap, a multiple of the stride; default: 16 strides, more than a frame and those
-            just before it reach.
+        tile: side of the tiles into which large frames are cut, pixels; None: whole frames. The result equals that of
+            whole frames where the network sees no further than `margin` pixels beyond a tile.
+        margin: overlap of tiles in pixels, a multiple of the stride; default: 16 strides, more than the reach of a
+            frame and the few before it.
 
     Raises:
-        ValueError: for a tile or margin that the stride does not divide; frames that change size.
+        ValueError: a tile or margin that is not a multiple of the stride; frames that change size.
     """
     margin = REACH * net.stride if margin is None else margin
     if tile is not None and (tile <= 0 or tile % net.stride or margin < 0 or margin % net.stride):
@@ -274,7 +274,7 @@ def enhance(
 
 
 def _tiles(shape: tuple[int, int], tile: int | None, margin: int) -> Iterator[tuple[tuple[slice, ...], ...]]:
-    """Of each tile: what is read of the frame, what is kept of that, and where it goes."""
+    """For each tile: the part of the frame to read, the part of that to keep, and where it goes."""
     if tile is None:
         everything = (slice(0, shape[0]), slice(0, shape[1]))
         yield everything, everything, everything

@@ -70,8 +70,8 @@ def few_candidates(monkeypatch, request):
     """A library of the effects that the test's module names in FEW, for time's sake."""
     whole = candidates.built_in
 
-    def some(model, darks):
-        return {name: maker for name, maker in whole(model, darks).items() if name in request.module.FEW}
+    def some(facts):
+        return {name: maker for name, maker in whole(facts).items() if name in request.module.FEW}
 
     monkeypatch.setattr(importlib.import_module("hsnoise.criticism.diagnose"), "built_in", some)
 

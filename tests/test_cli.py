@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import criticism
 from hsnoise._core import output as _output
 from hsnoise.cli import demo as _demo
 from hsnoise.cli import options as _options
+from hsnoise.cli import results as _results
 from hsnoise.cli.loading import load_capture
 from hsnoise.cli.main import main
 from hsnoise.criticism import Comparison, Step, Story
+from hsnoise.criticism.outcomes import Ended, Ending
 
 COMMANDS = ("demo", "fit", "compare", "diagnose", "improve", "sample", "train", "evaluate")
 
@@ -108,15 +109,15 @@ def test_fitted_model_can_be_sampled(fitted, tmp_path, capsys):
 def short_loop(monkeypatch):
     """The loop without its draws: the first fit, and an addition made up."""
 
-    def improve(stack, *, keep, **_):
+    def improve(stack, tell, *, keep, **_):
         fit, groups = hsnoise.fit(stack), {"noise": 1.0}
         errors = [Comparison(error, groups, (), (), 0.5, -3.0, ()) for error in (40.0, 1.2)]
         added = replace(fit, params=fit.params.add(hsnoise.effects.RowNoise(1.0)))
         steps = [Step(fit, errors[0], None, None, -9.0, ()), Step(added, errors[1], None, "row_noise", -9.0, ())]
-        keep(Story((steps[0],), "Not finished."))
-        return Story(tuple(steps), "Nothing significant is left.")
+        keep(Story((steps[0],), Ending(Ended.UNFINISHED)))
+        return Story(tuple(steps), Ending(Ended.FINISHED))
 
-    monkeypatch.setattr(criticism, "improve", improve)
+    monkeypatch.setattr(_results, "improved", improve)
 
 
 def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, short_loop):
@@ -131,18 +132,18 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert float(lines["gain.R"][4]) == pytest.approx(1.53, abs=0.05)
     assert lines["black_level.R"][2] == "held"
     assert {path.name for path in out.iterdir()} >= {"capture.npz", "model.json", "table.csv", "story.png"}
-    assert "truth" in said and "Hidden in these frames was row_noise" in said
+    assert "truth" in said and "The hidden effect was row_noise" in said
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 
 def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop, capsys):
-    whole = criticism.improve
+    whole = _results.improved
 
-    def broken_off(stack, **keywords):
-        whole(stack, **keywords)
+    def broken_off(*arguments, **keywords):
+        whole(*arguments, **keywords)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(criticism, "improve", broken_off)
+    monkeypatch.setattr(_results, "improved", broken_off)
     arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
     assert main(arguments) == 130
     said = capsys.readouterr().err.splitlines()[-1]

@@ -63,7 +63,10 @@ def test_a_video_is_enhanced(place, capsys, channels, more):
 
 def test_without_weights_those_that_come_with_hsnoise_are_taken(place, capsys):
     assert main(["enhance", str(place / "clip.npz"), str(place / "shipped.mp4")]) == 0
-    assert "Weights that come with hsnoise, trained for canon_5d3, white of 1.6 to 6.2" in capsys.readouterr().err
+    assert (
+        "Using the weights that come with hsnoise, trained for canon_5d3, white of 1.6 to 6.2"
+        in capsys.readouterr().err
+    )
     assert np.stack(list(frames_of(place / "shipped.mp4"))).shape == FRAMES.shape
 
 

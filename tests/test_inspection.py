@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 
 import hsnoise
+from hsnoise._core.types import StatedGain
 from hsnoise.cli.main import main
 from hsnoise.frames.stack import FrameStack
 
@@ -49,7 +50,7 @@ def test_the_gain_of_flats(rng):
 
 @pytest.mark.parametrize("electrons_per_dn, word", [(0.5, "agrees"), (3.0, "wrong or nominal")])
 def test_the_gain_of_a_header(rng, electrons_per_dn, word):
-    stated = hsnoise.stack.StatedGain(1 / electrons_per_dn, f"EGAIN {electrons_per_dn} e-/DN", certain=True)
+    stated = StatedGain(1 / electrons_per_dn, f"EGAIN {electrons_per_dn} e-/DN", certain=True)
     said = findings([darks(rng, 0), flats(rng, 900)], [0, 1], kind=["dark", "flat"], stated_gain=stated)
     assert word in said and stated.source in said
 

@@ -12,8 +12,8 @@ from scipy import stats
 import hsnoise
 from hsnoise._core.compiling import _lean_options, jit_lean
 from hsnoise.likelihood import plan
-from hsnoise.likelihood.moments import start_physics
-from hsnoise.likelihood.physics import evaluate, physics_of
+from hsnoise.likelihood.darks import evaluate, likelihood_part
+from hsnoise.likelihood.moments import start_model
 from hsnoise.likelihood.plan import plan_rules
 from hsnoise.likelihood.summary import some_frames, summarise
 from hsnoise.model import sample_dark
@@ -127,11 +127,11 @@ def moved(model, factor):
 def test_gradient_matches_differences(shutter):
     model = camera(shutter=shutter, black_level_dn=10.0)
     summary = hsnoise.summarise(capture(model, shape=(32, 64)))
-    physics = physics_of(model)
-    rules = plan_rules(physics, summary)
-    value = jax.jit(lambda p: evaluate(p, summary, rules))
-    leaves, structure = jax.tree.flatten(jax.grad(value)(physics))
-    points = jax.tree.leaves(physics)
+    known = likelihood_part(model)
+    rules = plan_rules(known, summary)
+    value = jax.jit(lambda m: evaluate(m, summary, rules))
+    leaves, structure = jax.tree.flatten(jax.grad(value)(known))
+    points = jax.tree.leaves(known)
     for i, (point, slope) in enumerate(zip(points, leaves, strict=True)):
         step = 1e-4 * np.maximum(np.abs(point), 0.1)
         ends = [structure.unflatten([*points[:i], point + s * step, *points[i + 1 :]]) for s in (1, -1)]
@@ -144,7 +144,7 @@ def test_jit_vmap_and_a_float32_session_give_the_same():
     summary = hsnoise.summarise(capture(model, shape=(16, 32)))
     factors = jnp.array([0.97, 1.0, 1.03])
     models = [moved(model, f) for f in factors]
-    rules = plan_rules(physics_of(model), summary)
+    rules = plan_rules(model, summary)
     one_by_one = [float(hsnoise.log_likelihood(m, summary, rules=rules)) for m in models]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *models)
     batched = jax.jit(jax.vmap(lambda m: hsnoise.log_likelihood(m, summary, rules=rules)))(batch)
@@ -165,19 +165,18 @@ def test_bins_that_no_row_uses_make_no_difference(row_gain, monkeypatch):
     frames[1][0, 3, ::16] = [90, 300, 5000, 16000]
     model = model if row_gain else model.remove("row_gain")
     summary = hsnoise.summarise(hsnoise.FrameStack(frames, EXPOSURE_S, black_level=40, cfa="RGGB", shutter="global"))
-    physics = physics_of(model)
-    value = jax.jit(lambda p, rules: evaluate(p, summary, rules))
-    fewer = plan_rules(physics, summary)
+    known = likelihood_part(model)
+    value = jax.jit(lambda rules, outliers: evaluate(known, summary, rules, outliers))
+    fewer = plan_rules(known, summary)
     monkeypatch.setattr(plan, "_used_bins", lambda histograms: histograms)
-    all_bins = plan_rules(physics, summary)
+    all_bins = plan_rules(known, summary)
     assert fewer[0].outlier_law.shape[-1] < all_bins[0].outlier_law.shape[-1]
     padded = plan.replan(all_bins, fewer)
     assert padded[0].outlier_law.shape == all_bins[0].outlier_law.shape
     for outliers in (None, jnp.full(2, 1e-3)):
-        at = eqx.tree_at(lambda p: p.outliers, physics, outliers, is_leaf=lambda x: x is None)
-        expected = float(value(at, all_bins))
+        expected = float(value(all_bins, outliers))
         for rules in (fewer, padded):
-            np.testing.assert_allclose(float(value(at, rules)), expected, rtol=1e-9)
+            np.testing.assert_allclose(float(value(rules, outliers)), expected, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -185,9 +184,9 @@ def test_rules_hold_away_from_where_they_were_made():
     """A rule made at the truth is still exact where a fit may wander; finer rules change nothing."""
     model = camera(shutter="rolling", black_level_dn=10.0)
     summary = hsnoise.summarise(capture(model, shape=(64, 96), frames=4))
-    rules = plan_rules(physics_of(model), summary)
+    rules = plan_rules(model, summary)
     for factor in (0.9, 1.0, 1.1):
-        there = physics_of(moved(model, factor))
+        there = likelihood_part(moved(model, factor))
         ours, own = evaluate(there, summary, rules), evaluate(there, summary, plan_rules(there, summary))
         np.testing.assert_allclose(float(ours), float(own), rtol=0, atol=1e-4)
 
@@ -250,5 +249,5 @@ def test_programs_of_fits_are_compiled_lean():
 def test_frames_that_only_some_exposures_have_make_a_piece(rng):
     counts = [np.rint(100 + 5 * rng.standard_normal((n, 16, 16))).astype(np.uint16) for n in (8, 2)]
     summary = summarise(hsnoise.FrameStack(counts, EXPOSURE_S, shutter="global", black_level=90))
-    (rule,) = plan_rules(start_physics(summary), some_frames(summary, 4, 8))
+    (rule,) = plan_rules(start_model(summary), some_frames(summary, 4, 8))
     assert np.isfinite(rule.edges_dn).all()

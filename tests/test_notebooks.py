@@ -18,7 +18,8 @@ from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Light
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.finding import Unexplained
-from hsnoise.fitting.result import FitResult
+from hsnoise.criticism.outcomes import Ended, Ending
+from hsnoise.fitting.result import FitResult, Method, Status
 
 NASTY = "<img src=x onerror=\"alert(1)\"> & 'quotes' </table></div>"
 MODEL = hsnoise.NoiseModel(
@@ -64,7 +65,9 @@ def stack():
 def results(stack):
     """One of each kind, with a hostile text in all that takes text."""
     names, covariance = ("gain", "dark_current.rate"), np.diag([0.01, 25.0])
-    fit = FitResult(MODEL, names, covariance, "ml", "converged", 9, 0.0, (NASTY,), hsnoise.summarise(stack), None)
+    fit = FitResult(
+        MODEL, names, covariance, Method.ML, Status.CONVERGED, NASTY, 9, 0.0, (NASTY,), hsnoise.summarise(stack), None
+    )
     fit = replace(fit, doubts=("Odd frames.", NASTY), withheld=("read_noise.sigma",))
     before = comparison(88.1, (f"row x frame: G: measured 4, {NASTY}",))
     steps = (
@@ -79,7 +82,7 @@ def results(stack):
         "Inspection": replace(hsnoise.inspect(stack), findings=(NASTY,)),
         "Comparison": before,
         "Diagnosis": diagnosis(),
-        "Story": Story(steps, f"Nothing significant is left (error 1.10). {NASTY}"),
+        "Story": Story(steps, Ending(Ended.FINISHED), NASTY),
     }
 
 

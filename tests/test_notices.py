@@ -48,7 +48,7 @@ def test_a_fit_tells_before_the_work_and_not_of_a_colour_sensor():
 
 def test_exposures_that_files_contradict_are_told(tmp_path):
     np.savez(tmp_path / "darks.npz", counts=darks()[None], exposure_s=[0.2], cfa="RGGB")
-    with pytest.warns(UserWarning, match=r"exposure_s: .*darks.npz says 0.2 s; the given 3 s are taken"):
+    with pytest.warns(UserWarning, match=r"exposure_s: .*darks.npz says 0.2 s; the given 3 s are used"):
         stack = hsnoise.load(tmp_path / "darks.npz", exposure_s=3)
     assert stack.exposure_s.tolist() == [3]
     assert hsnoise.load(tmp_path / "darks.npz", exposure_s=0.2).exposure_s.tolist() == [0.2]

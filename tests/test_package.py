@@ -36,7 +36,7 @@ assert hsnoise.cli.main(["enhance", "raw.npz", "bright.mp4", "--camera", "canon_
 from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
-from hsnoise.training.vgg import LAYERS, read_weights
+from hsnoise.enhance.training.vgg import LAYERS, read_weights
 state = {f"features.{i}.weight": np.zeros((o, c, 3, 3), np.float32) for i, c, o in LAYERS}
 state |= {f"features.{i}.bias": np.zeros(o, np.float32) for i, _, o in LAYERS}
 save_file(state, "vgg.safetensors")
@@ -44,7 +44,7 @@ assert len(read_weights(Path("vgg.safetensors"))[0]) == 2 * len(LAYERS)
 """,
     "peers": """
 import numpy as np
-from hsnoise.training.rivals import rivals
+from hsnoise.enhance.training.rivals import rivals
 frames = np.random.default_rng(0).random((8, 24, 24, 3)).astype(np.float32)
 assert {"BM3D", "BM4D over frames"} <= set(rivals())
 for name in ("BM3D", "BM4D over frames"):

@@ -15,7 +15,6 @@ import pytest
 
 import hsnoise
 from hsnoise import plots
-from hsnoise.likelihood.physics import physics_of
 from hsnoise.likelihood.summary import summarise
 from hsnoise.plots._histograms import _coarse
 from hsnoise.plots._moments import beta_rule, count_moments
@@ -144,13 +143,13 @@ def test_clipped_points_are_hollow():
 
 
 def test_moments_of_counts_are_those_of_samples():
-    physics = fitted().physics
+    params = fitted().params
     rng = np.random.default_rng(5)
     n, t, beta, white = 400_000, 0.05, 1.3, 12.0
-    gain, rate, read = float(physics.gain[0]), float(physics.dark_current), float(physics.read_noise)
+    gain, rate, read = (params.table[name][0] for name in ("gain", "dark_current.rate", "read_noise.sigma"))
     electrons = rng.poisson(rate * t, n) + read * rng.standard_normal(n)
     counts = np.clip(np.rint(gain * beta * electrons), 0, white)
-    mean, variance = count_moments(physics, 0, [t], [beta], white)
+    mean, variance = count_moments(params, 0, [t], [beta], white)
     assert abs(counts.mean() - mean[0, 0]) < 5 * counts.std() / np.sqrt(n)
     fourth = ((counts - counts.mean()) ** 4).mean()
     assert abs(counts.var() - variance[0, 0]) < 5 * np.sqrt((fourth - counts.var() ** 2) / n)
@@ -204,7 +203,7 @@ def test_flats_alone_have_a_photon_transfer():
     key = jax.random.key(2)
     lit = [hsnoise.sample(key, np.full((3, 32, 64), e), truth, exposure_s=0.1) for e in (20.0, 100.0, 500.0)]
     summary = summarise(hsnoise.FrameStack(lit, [0.1] * 3, kind="flat", black_level=100, shutter="global"))
-    fit = SimpleNamespace(summary=summary, physics=physics_of(truth), params=truth, transfer=None)
+    fit = SimpleNamespace(summary=summary, params=truth, transfer=None)
     axes, gains = plots.photon_transfer(fit).axes
     assert "gain against signal" in gains.get_title()
     signal = axes.collections[-1].get_offsets()[:, 0]

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import criticism, plots, report
 from hsnoise import effects as fx
+from hsnoise import plots, report
 from hsnoise.cli import demo as _demo
+from hsnoise.cli import results as _results
 from hsnoise.cli.main import main
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.diagnose import Unexplained
-from hsnoise.criticism.improve import UNFINISHED
-from hsnoise.fitting.result import NOT_CONVERGED, FitResult
+from hsnoise.criticism.outcomes import Ended, Ending
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.plots._groups import family_of, parts_of
 from hsnoise.report import _context, _figures, _measured, _pictures
 from hsnoise.simulation.draws import draw_capture
@@ -73,7 +74,17 @@ def comparison(error=1.1, p_value=0.5, worst=()):
 def story(stack):
     covariance = np.diag([0.01, 25.0])
     fit = FitResult(
-        PLAIN, ("gain.R", "dark_current.rate"), covariance, "ml", "converged", 9, 0.0, ("A note.",), None, None
+        PLAIN,
+        ("gain.R", "dark_current.rate"),
+        covariance,
+        Method.ML,
+        Status.CONVERGED,
+        "",
+        9,
+        0.0,
+        ("A note.",),
+        None,
+        None,
     )
     better = replace(fit, params=PLAIN.add(fx.RowNoise(4.0)))
     before = comparison(88.1, 0.02, ("row x frame: G: measured 4, the model gives 1",))
@@ -82,7 +93,7 @@ def story(stack):
         Step(fit, before, diagnosis(), None, -100.0, ()),
         Step(better, comparison(), diagnosis("nothing missing", ()), "row_noise", -20.0, moved),
     )
-    return Story(steps, "Nothing significant is left (error 1.10).")
+    return Story(steps, Ending(Ended.FINISHED))
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +291,7 @@ def test_a_page_of_a_fit_says_its_doubts(stack, story):
 
 
 def test_a_page_of_an_unfinished_story_says_so(stack, story):
-    so_far = replace(story, steps=story.steps[:1], ended=UNFINISHED)
+    so_far = replace(story, steps=story.steps[:1], ending=Ending(Ended.UNFINISHED))
     text = Elements(report.page(so_far, stack)).text
     assert "Do not use this Not finished (error 88.1)" in text
     assert "This page was written while the search went on." in text
@@ -338,7 +349,7 @@ def test_the_command_line_writes_it(tmp_path, monkeypatch, compared, capsys):
     out = tmp_path / "out"
     arguments = ["--model", str(tmp_path / "model.json"), "--out", str(out), "--report", str(out / "report.html")]
     assert main(["compare", str(darks), *arguments, "--debug"]) == 0
-    assert f"Reported in {out / 'report.html'}" in capsys.readouterr().out
+    assert f"Report: {out / 'report.html'}" in capsys.readouterr().out
     assert "darks.npz" in (out / "report.html").read_text()
     assert sorted(path.name for path in out.iterdir()) == ["comparison.png", "report.html"]
 
@@ -349,15 +360,15 @@ def test_a_story_that_is_broken_off_has_its_page(command, tmp_path, monkeypatch,
     darks, out, pages = tmp_path / "darks.npz", tmp_path / "out", []
     assert main(["sample", str(tmp_path / "model.json"), "--out", str(darks), "--frames", "3", "--shape", "32x64"]) == 0
     bare = replace(story.fit, params=MONO)
-    started = Story((replace(story.steps[0], fit=bare, diagnosis=None),), UNFINISHED)
-    ended = replace(started, ended="Nothing significant is left.")
+    started = Story((replace(story.steps[0], fit=bare, diagnosis=None),), Ending(Ended.UNFINISHED))
+    ended = replace(started, ending=Ending(Ended.FINISHED))
 
-    def improve(stack, *, keep, **_):
+    def improve(stack, tell, *, keep, **_):
         keep(started)
         pages.append((out / "report.html").read_text())
         return ended
 
-    monkeypatch.setattr(criticism, "improve", improve)
+    monkeypatch.setattr(_results, "improved", improve)
     monkeypatch.setattr(_demo, "fit_with_progress", lambda *_: SimpleNamespace(has_gain=True))
     given = ["--data", str(darks)] if command == "demo" else [str(darks), "--report", str(out / "report.html")]
     assert main([command, *given, "--out", str(out), "--debug"]) == 0
@@ -368,7 +379,7 @@ def test_a_story_that_is_broken_off_has_its_page(command, tmp_path, monkeypatch,
 
 def test_a_story_says_what_is_open(story):
     first, last = story.steps
-    unmet = replace(last.fit, outcome=f"{NOT_CONVERGED}simulated statistics not met")
+    unmet = replace(last.fit, status=Status.NOT_MET)
     told = str(replace(story, steps=(first, replace(last, ahead=2.0, fit=unmet))))
     assert "row_noise fits as well on the other side of the gain" in told
     assert "the last fit has NOT CONVERGED" in told

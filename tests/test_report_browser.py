@@ -13,8 +13,8 @@ from hsnoise import effects as fx
 from hsnoise import report
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.diagnose import Unexplained
-from hsnoise.criticism.improve import UNFINISHED
-from hsnoise.fitting.result import FitResult
+from hsnoise.criticism.outcomes import Ended, Ending
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.plots._groups import FAMILIES
 from hsnoise.simulation.draws import draw_capture
 
@@ -84,7 +84,7 @@ def capture(model, exposure_s):
 
 def compared(error):
     """A comparison in which the groups are off by factors of all sizes up to `error`."""
-    groups = {group: 1.6 * error ** (1 - i / 13) for i, group in enumerate([*FAMILIES, "flats, static pixels"])}
+    groups = {group: 1.6 * error ** (1 - i / 13) for i, group in enumerate([*FAMILIES][:14])}
     row = ("noise: log variance, G, short exposures", "noise", 3.1, 2.9, 44.0)
     worst = (f"{row[0]}: measured 3.1, the model gives 2.9 (44 standard deviations above)",)
     return Comparison(error, groups, (row,), worst, 0.02, -3.0, ("Curvature needs three exposures.",))
@@ -97,17 +97,19 @@ def diagnosis():
     return Diagnosis(ranking, "named", ranking[0], names[:1], "", left)
 
 
-def told(errors, ended):
+def told(errors, ending):
     """A story of as many steps as errors."""
     model, doubts = MODEL, ("The read noise of long exposures is higher than that of short ones by 4 %.",)
     steps = []
     for i, error in enumerate(errors):
         model = MODEL if i == 0 else model.add(ADDED[i - 1])
-        fit = FitResult(model, ("gain.R",), np.diag([0.01]), "ml", "converged", 9, 0.0, ("A note.",), None, None)
+        fit = FitResult(
+            model, ("gain.R",), np.diag([0.01]), Method.ML, Status.CONVERGED, "", 9, 0.0, ("A note.",), None, None
+        )
         fit = replace(fit, doubts=doubts)
         added = ADDED[i - 1].name if i else None
         steps.append(Step(fit, compared(error), diagnosis(), added, -9.0, ("gain.R moved.",)))
-    return Story(tuple(steps), ended)
+    return Story(tuple(steps), ending)
 
 
 @pytest.fixture(scope="module")
@@ -115,16 +117,16 @@ def pages(tmp_path_factory):
     """Pages by their names, as files."""
     truth = MODEL.add(ADDED[0])
     bayer, mono = capture(truth, (0.2,)), capture(replace_colours(truth), (0.05, 0.2))
-    story = told((4e4, 531.0, 12.0, 1.2), "Nothing significant is left (error 1.20).")
+    story = told((4e4, 531.0, 12.0, 1.2), Ending(Ended.FINISHED))
     fit = story.steps[0].fit
     found = {
         "improve": (story, bayer, {}),
         "unfinished": (
-            told((4e4, 531.0), UNFINISHED),
+            told((4e4, 531.0), Ending(Ended.UNFINISHED)),
             bayer,
             {},
         ),
-        "one step": (told((1.0,), "Nothing significant is left (error 1.00)."), bayer, {}),
+        "one step": (told((1.0,), Ending(Ended.FINISHED)), bayer, {}),
         "compare": (compared(88.0), bayer, {"fit": MODEL}),
         "diagnose": (diagnosis(), bayer, {"fit": fit, "comparison": compared(88.0)}),
         "fit": (fit, bayer, {}),

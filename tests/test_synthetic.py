@@ -17,8 +17,8 @@ from hsnoise.fitting.simulated import (
     Problem,
     _search,
     fit_synthetic,
-    knobs,
 )
+from hsnoise.likelihood.parameters import parameters_of
 
 STATISTICS, NUMBERS = 60, 3
 SLOPES = np.random.default_rng(0).standard_normal((STATISTICS, NUMBERS))
@@ -68,7 +68,7 @@ def hidden():
 def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
     stack, base = hidden
     model = base.params.add(RowNoise(1.4))
-    problem = Problem(stack, base, model, ("row_noise",), knobs(model, ("row_noise",)), 0, model)
+    problem = Problem(stack, base, model, ("row_noise",), 0, model)
     # Parameters that are known to a few per cent, whatever coordinates stand for them.
     assert np.all(problem.prior[: len(base.names)] < 1e-3)
     steps = problem.slope(problem.centre)[:, None] * problem.whiten
@@ -94,35 +94,36 @@ def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
         (fx.Nonlinearity(1e-5), "nonlinearity.curvature"),  # tiny in its unit
     ],
 )
-def test_a_step_of_a_knob_moves_it_by_a_share_of_itself_or_its_range(effect, label):
+def test_a_step_of_a_number_moves_it_by_a_share_of_itself_or_its_range(effect, label):
     model = hsnoise.cameras.grasshopper3().add(effect)
-    (knob,) = [k for k in knobs(model, (effect.name,)) if k.label == label]
-    x = knob.read(model)
-    start, ahead = knob.inverse(x), knob.inverse(x + 0.2)
+    parameters = parameters_of(model, (effect.name,))
+    x, i = parameters.read(model), parameters.names.index(label)
+    start, ahead = (float(parameters.values(x + step)[i]) for step in (0.0, 0.2))
     assert 0.002 < (ahead - start) / (start or 1.0) < 0.3
-    assert knob.slope(x) == pytest.approx((knob.inverse(x + 1e-6) - knob.inverse(x - 1e-6)) / 2e-6, rel=1e-3)
+    difference = (parameters.values(x + 1e-6) - parameters.values(x - 1e-6)) / 2e-6
+    np.testing.assert_allclose(parameters.slope(x), difference, rtol=1e-3)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.004, 0.5])
 def test_an_exponent_moves_as_far_from_any_start(start):
     model = hsnoise.cameras.canon_5d3().add(RowNoise(1.0, start))
-    (knob,) = [k for k in knobs(model, ("row_noise",)) if k.label == "row_noise.exponent"]
-    x = knob.read(model)
-    assert knob.inverse(x + 0.2) - knob.inverse(x) == pytest.approx(0.2)
+    parameters = parameters_of(model, ("row_noise",))
+    x, i = parameters.read(model), parameters.names.index("row_noise.exponent")
+    assert float(parameters.values(x + 0.2)[i] - parameters.values(x)[i]) == pytest.approx(0.2)
 
 
-def test_what_an_effect_holds_is_no_knob():
+def test_what_an_effect_holds_is_not_moved():
     model = hsnoise.cameras.grasshopper3().add(fx.PeriodicBanding(1.0, 0.2))
-    assert [k.label for k in knobs(model, ("periodic_banding",))] == ["periodic_banding.amplitude"]
+    assert parameters_of(model, ("periodic_banding",)).names == ("periodic_banding.amplitude",)
     edge = hsnoise.cameras.grasshopper3().add(fx.AmplifierGlow(10.0, 0.3, row=0.5, column=1.0))
-    labels = [k.label for k in knobs(edge, ("amplifier_glow",))]
-    assert labels == [f"amplifier_glow.{name}" for name in ("rate", "scale", "row", "aspect")]
+    moved = tuple(f"amplifier_glow.{name}" for name in ("rate", "scale", "row", "aspect"))
+    assert parameters_of(edge, ("amplifier_glow",)).names == moved
 
 
 class Bent:
     """A problem whose statistics are arcs of the first number: Newton's steps from far away lead further away."""
 
-    part, knobs, centre, other_start = None, (), np.zeros(0), None
+    part, centre, other_start = None, np.zeros(0), None
     start, truth, prior = np.array([2.5, 0.3]), np.array([0.2, -0.1]), np.full(2, 1e-6)
 
     def draw(self, y, number):

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import criticism
 from hsnoise._core.conclusion import Conclusion, Light
+from hsnoise._core.naming import as_options, named, setting
 from hsnoise.cli import main as cli
+from hsnoise.cli import results as _results
 from hsnoise.cli.main import main
-from hsnoise.cli.telling import Page, in_options, tell
+from hsnoise.cli.telling import Page, tell
 from hsnoise.criticism import Candidate, Diagnosis, Step, Story
 from hsnoise.criticism.finding import Unexplained
+from hsnoise.criticism.outcomes import Ended, Ending
 
 NOTES = tuple(f"note {i} says what the frames do not determine, at such length that it fills a line" for i in range(60))
 DOUBTS = ("the first doubt is in the sentence", "another doubt is above the table")
@@ -46,7 +48,7 @@ def found(capture):
     for i, one in enumerate(effects):
         added = replace(fit, params=steps[-1].fit.params.add(one))
         steps.append(Step(added, replace(comparison, error=9.0 - i), None, one.name, -9.0, ("gain moved.",)))
-    story = Story(tuple(steps), "Nothing significant is left (error 7.00).", "All frames were fitted.")
+    story = Story(tuple(steps), Ending(Ended.FINISHED), "All frames were fitted.")
     return {"fit": fit, "compare": comparison, "diagnose": diagnosis, "improve": story}
 
 
@@ -56,7 +58,7 @@ def printed(found, capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "fit_with_progress", lambda *_: found["fit"])
     monkeypatch.setattr(hsnoise, "compare", lambda *_, **__: found["compare"])
     monkeypatch.setattr(hsnoise, "diagnose", lambda *_, **__: found["diagnose"])
-    monkeypatch.setattr(criticism, "improve", lambda *_, **__: found["improve"])
+    monkeypatch.setattr(_results, "improved", lambda *_, **__: found["improve"])
 
     def run(command: str, *options: str) -> str:
         more = [] if command == "inspect" else ["--out", str(tmp_path / command)]
@@ -154,9 +156,15 @@ def test_a_sentence_longer_than_the_screen_is_told(capsys):
     assert said.count("word") == 1000 and "1 more line: --verbose" in said
 
 
-def test_messages_name_options():
-    assert in_options("cfa: expected one of these") == "--cfa: expected one of these"
-    assert in_options("give black_level=512, or cfa='RGGB'") == "give --black-level 512, or --cfa 'RGGB'"
+def test_sentences_name_options_on_the_command_line():
+    def said():
+        return f"{named('cfa')}: give {setting('black_level', 512)}, {setting('cfa', 'RGGB')} or {setting('kind')}"
+
+    with as_options(cli.OPTIONS):
+        assert said() == "--cfa: give --black-level 512, --cfa 'RGGB' or --kind"
+        with as_options({"cfa": "--colours"}):
+            assert said() == "--colours: give --black-level 512, --colours 'RGGB' or --kind"
+    assert said() == "cfa: give black_level=512, cfa='RGGB' or kind="
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".npy", ".tif", ".fits"])

@@ -127,9 +127,9 @@ def test_an_interrupt_keeps_the_steps_until_then(folder, tmp_path, monkeypatch, 
         with pytest.raises(SystemExit):
             run_train(arguments(folder, tmp_path / "run"))
     assert [path.name for path in checkpoints.checkpoints(tmp_path / "run")] == ["checkpoint-00000004.eqx"]
-    assert "the same command goes on where it stopped" in capsys.readouterr().out
+    assert "the same command resumes here" in capsys.readouterr().out
     run_train(arguments(folder, tmp_path / "run"))
-    assert "Going on from step 4" in capsys.readouterr().out
+    assert "Resuming from step 4" in capsys.readouterr().out
     for one, other in zip(
         leaves(tmp_path / "whole" / train.ENDED), leaves(tmp_path / "run" / train.ENDED), strict=True
     ):
@@ -196,7 +196,7 @@ def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
     cut.write_bytes(cut.read_bytes()[:-4])
     said = []
     assert checkpoints.read_newest(tmp_path, tree, said.append)[1]["step"] == 100
-    assert "taking the one before" in said[0]
+    assert "using the one before" in said[0]
     for step in (150, 160):
         checkpoints.write(tmp_path, step, tree, {})
     assert [path.name[11:19] for path in checkpoints.checkpoints(tmp_path)] == ["00000160", "00000150"]

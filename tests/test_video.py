@@ -106,7 +106,7 @@ def test_a_video_that_ends_early_is_told(tmp_path, damage):
     write_video(path, frames, Fraction(25))
     assert len(list(frames_of(path))) == 50
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.warns(UserWarning, match=r"cut off or damaged; \d+ frames could be read, up to .* of a video of 2 s"):
+    with pytest.warns(UserWarning, match=r"truncated or damaged; \d+ frames could be read, up to .* of a video of 2 s"):
         assert len(list(frames_of(path))) < 40
 
 

@@ -41,7 +41,7 @@ def test_a_damaged_file_is_told(tmp_path, damage):
     path = tmp_path / "net.eqx"
     save_network(path, NET, {})
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match="cut off or changed|not a file of weights"):
+    with pytest.raises(ValueError, match="truncated, or changed|not a file of weights"):
         load_network(path)
 
 
@@ -50,7 +50,7 @@ def test_arrays_of_another_network_are_told(tmp_path):
     write_arrays(path, NET, {})
     with pytest.raises(ValueError, match="another network"):
         read_arrays(path, STLSTM(jax.random.key(0), maps=4, kernels=(3, 5), channels=1))
-    with pytest.raises(ValueError, match="holds no network; .* give weights.eqx"):
+    with pytest.raises(ValueError, match="holds no network; give the weights.eqx"):
         load_network(path)
 
 

@@ -1,24 +1,24 @@
-"""Arguments checked one by one; errors say what was expected and what came."""
+"""Arguments checked one by one; errors say what was expected and what was given."""
 
 from __future__ import annotations
 
-import itertools
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import Window
 
-MOST_SEED = 2**31  # those of single draws are counted from it
+MOST_SEED = 2**31  # single draws count their seeds up from it
 
 
 def span(name: str, value: Any, size: int) -> slice:
     """A (start, stop) pair, a slice or None (all) as a slice within 0..size.
 
     Raises:
-        ValueError: it is empty, reaches outside, or has a step.
+        ValueError: it is empty, reaches outside 0..size, or has a step.
     """
     ends = (None, None) if value is None else value
     if isinstance(ends, slice):
@@ -30,50 +30,44 @@ def span(name: str, value: Any, size: int) -> slice:
         )
         if 0 <= start < stop <= size:
             return slice(start, stop)
-    raise ValueError(f"{name}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
+    raise ValueError(f"{named(name)}: expected (start, stop) with 0 <= start < stop <= {size}, got {value}")
 
 
 def seed_of(name: str, value: Any) -> int:
-    """A seed of random draws. Raises TypeError for what is no whole number, ValueError outside 0 to MOST_SEED."""
+    """A seed of random draws. Raises TypeError unless it is a whole number, ValueError outside 0 to MOST_SEED."""
     seed = whole_number(name, value, 0)
     if seed > MOST_SEED:
-        raise ValueError(f"{name}: expected at most {MOST_SEED}, got {value}")
+        raise ValueError(f"{named(name)}: expected at most {MOST_SEED}, got {value}")
     return seed
 
 
 def whole_number(name: str, value: Any, least: int | None = None) -> int:
-    """`value` as an int. Raises TypeError for what is no whole number, ValueError below `least`."""
+    """`value` as an int. Raises TypeError unless it is a whole number, ValueError below `least`."""
     try:
         number = operator.index(value)
     except TypeError:
-        raise TypeError(f"{name}: expected a whole number, got {value!r}") from None
+        raise TypeError(f"{named(name)}: expected a whole number, got {value!r}") from None
     if least is not None and number < least:
-        raise ValueError(f"{name}: expected at least {least}, got {value}")
+        raise ValueError(f"{named(name)}: expected at least {least}, got {value}")
     return number
 
 
 def listed(name: str, value: Any, expected: str) -> tuple[Any, ...]:
-    """`value` as a tuple. Raises TypeError for what is no list."""
+    """`value` as a tuple. Raises TypeError unless it is a list."""
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise TypeError(f"{name}: expected {expected}, got {value!r}")
+        raise TypeError(f"{named(name)}: expected {expected}, got {value!r}")
     return tuple(value)
 
 
 def callback(name: str, function: Any) -> Callable[..., Any]:
-    """A user's function, or for None one that does nothing. Raises TypeError for what cannot be called."""
+    """A user's function; for None, one that does nothing. Raises TypeError unless it can be called."""
     if function is not None and not callable(function):
-        raise TypeError(f"{name}: expected a function or None, got {function!r}")
+        raise TypeError(f"{named(name)}: expected a function or None, got {function!r}")
     return function or (lambda *told: None)
 
 
-def counter(say: Callable[[str], Any], text: str, total: int | None = None) -> Callable[[], None]:
-    """A function that says `text` and how often it was called: "Drawing: 12", "Drawing: 12 of 40"."""
-    numbers, of = itertools.count(1), "" if total is None else f" of {total}"
-    return lambda: say(f"{text}: {next(numbers)}{of}")
-
-
 def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
-    """Four numbers that say where frames of `shape` lie on a sensor. Raises ValueError if they lie outside."""
+    """Four numbers: where frames of `shape` lie on a sensor. Raises ValueError if they lie outside."""
     if window is None:
         return None
     numbers = tuple(whole_number("window", n) for n in listed("window", window, "four whole numbers"))
@@ -86,20 +80,20 @@ def window_of(window: Any, shape: tuple[int, ...]) -> Window | None:
 
 
 def one_of(name: str, value: Any, allowed: Sequence[Any]) -> Any:
-    """The value, if it is one of those allowed."""
+    """The value, if it is among `allowed`; else raises ValueError."""
     if not isinstance(value, type(allowed[0])) or value not in allowed:
-        raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {value!r}")
+        raise ValueError(f"{named(name)}: expected one of {', '.join(map(repr, allowed))}, got {value!r}")
     return value
 
 
 def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
-    """Numbers as float64 `[length]`; a scalar will do for length 1."""
+    """Numbers as float64 `[length]`; a scalar is accepted for length 1."""
     try:
         array = np.atleast_1d(np.array(value, np.float64))
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name}: expected numbers, got {value!r}") from error
+        raise TypeError(f"{named(name)}: expected numbers, got {value!r}") from error
     if array.shape != (length,):
-        raise ValueError(f"{name}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
+        raise ValueError(f"{named(name)}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
     array.setflags(write=False)
     return array
 
@@ -107,7 +101,7 @@ def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
 def not_negative(name: str, values: np.ndarray) -> np.ndarray:
     """The values, if all are finite and none is negative."""
     if not np.isfinite(values).all() or (values < 0).any():
-        raise ValueError(f"{name}: expected finite numbers >= 0, got {values.tolist()}")
+        raise ValueError(f"{named(name)}: expected finite numbers >= 0, got {values.tolist()}")
     return values
 
 
@@ -115,5 +109,5 @@ def positive(name: str, value: Any) -> float:
     """One finite number > 0 as a float."""
     number = float(not_negative(name, numbers(name, value, 1, "stack"))[0])
     if number == 0:
-        raise ValueError(f"{name}: expected a number > 0, got {value!r}")
+        raise ValueError(f"{named(name)}: expected a number > 0, got {value!r}")
     return number

@@ -1,7 +1,7 @@
-"""Coloured series: their power spectra, which the draws and the likelihood share, and the draws themselves.
+"""Coloured noise series: the power spectra that draws and likelihood share, and the draws.
 
-A spectrum is the mean power of the n periodogram bins of a series of n, in units of its variance where that is 1: the
-bins' mean is 1, and white noise has 1 in each. Bin k holds min(k, n - k) cycles per series.
+A spectrum holds the mean power of the n periodogram bins of a series of length n and variance 1: the bins average 1,
+and white noise has 1 in each. Bin k stands for min(k, n - k) cycles per series.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hsnoise._core.types import RandomKey, Scalar
 def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
     """Spectrum [n] of power k^-exponent at k = 1 ... n/2 cycles, `dc` at k = 0, scaled to a mean of 1.
 
-    In the precision of the exponent. A series of one has only k = 0: 0 without `dc`.
+    The dtype is that of the exponent. A series of length 1 has only k = 0: power 0 without `dc`.
     """
     k = jnp.abs(jnp.fft.fftfreq(n, 1 / n)).astype(exponent.dtype)
     power = jnp.where(k == 0, dc, jnp.exp(-exponent * jnp.log(jnp.maximum(k, 1.0))))
@@ -24,14 +24,14 @@ def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
 
 
 def fading_power(n: int, exponent: Scalar) -> jax.Array:
-    """Power law [n] whose DC term, 1 of white noise, fades out toward an exponent of 1 (of either sign)."""
+    """Power law [n] whose DC term is 1 for white noise and falls to 0 at an exponent of 1 or -1."""
     return power_law(n, exponent, jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2)
 
 
 def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None = None) -> jax.Array:
-    """Spectrum [n] of a row gain: a power law without DC term, and a share of white noise with one; None: no share.
+    """Spectrum [n] of a row gain: a power law without DC term plus a share of white noise with one (None: no share).
 
-    Without a share the mean over all rows is exactly 1, whatever the exponent.
+    Without a share the mean over all rows is exactly 1 for any exponent.
     """
     coloured = power_law(n, exponent)
     return coloured if white_share is None else (1 - white_share) * coloured + white_share

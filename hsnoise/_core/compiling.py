@@ -1,4 +1,4 @@
-"""How programs are compiled that are large and run often."""
+"""Compiling large programs that run often."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import jax
 
 
 def jit_lean(function: Callable) -> Callable:
-    """`equinox.filter_jit` without XLA's fusion emitters for CPUs, for what is never part of another program.
+    """`equinox.filter_jit` without XLA's fusion emitters for CPUs, for functions that no other program calls.
 
-    The likelihood runs as fast without them, and takes half the time and half the memory to compile. JAX refuses such
-    options within another program, so that this is not for what users may trace.
+    Without them the likelihood runs as fast and compiles in half the time and memory. JAX refuses these options
+    inside another program, so do not use this for functions that users may trace.
     """
 
     @cache
-    def compiled():  # not before the first call: asking for the options starts a backend
-        jit: Any = eqx.filter_jit  # which hands on what its type does not tell
+    def compiled():  # at the first call, not on import: asking for the options starts a backend
+        jit: Any = eqx.filter_jit  # its type does not mention compiler_options
         return jit(function, compiler_options=_lean_options())
 
     return wraps(function)(lambda *arguments: compiled()(*arguments))

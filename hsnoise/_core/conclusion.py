@@ -1,4 +1,4 @@
-"""The finding in one sentence, with a light: may it be used?"""
+"""The conclusion in one sentence, with a traffic light: can the result be used?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Light(StrEnum):
-    """Whether a result may be used."""
+    """Whether a result can be used."""
 
     GREEN = "green"  # it fits
     AMBER = "amber"  # with doubts
@@ -16,10 +16,16 @@ class Light(StrEnum):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What a reader should know first: `light`, and why in one `sentence`."""
+    """What a reader should know first: `light`, and why, in a sentence (`head`) and what belongs to it (`rest`)."""
 
     light: Light
-    sentence: str
+    head: str
+    rest: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Head and rest."""
+        return f"{self.head} {self.rest}" if self.rest else self.head
 
     def __str__(self) -> str:
         return f"[{self.light}] {self.sentence}"

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def data_frame(source: Any, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Any:
-    """`rows` under the names of `columns` as a pandas DataFrame, for `to_pandas` of `source`.
+    """A pandas DataFrame of `rows` with the given `columns`, for the `to_pandas` method of `source`.
 
     Raises:
         ImportError: pandas is not installed.
@@ -21,6 +21,6 @@ def data_frame(source: Any, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 
 def table_to_pandas(source: Any) -> Any:
-    """The parameters in the `table` of a model or a fit as a DataFrame, a row each. Raises as `data_frame`."""
+    """The `table` of a model or a fit as a DataFrame, one row per parameter. Raises as `data_frame`."""
     columns = ("parameter", "value", "standard_error", "unit")
     return data_frame(source, columns, ((name, *row) for name, row in source.table.items()))

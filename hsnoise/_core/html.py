@@ -1,6 +1,6 @@
-"""Pieces of HTML that notebooks show of a result: a conclusion, tables, sentences.
+"""HTML for notebooks: the conclusion, tables and sentences of a result.
 
-Text is escaped here and nowhere else. Colours are the notebook's, light or dark, but for the dot of a conclusion.
+Text is escaped only here. Colours are the notebook's, light or dark, except for the dot of a conclusion.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from rich.table import Table
 
 from hsnoise._core.conclusion import Conclusion, Light
 
-COLOURS = {Light.GREEN: "#2da44e", Light.AMBER: "#d4920a", Light.RED: "#e5484d"}  # seen on white and on black
+COLOURS = {Light.GREEN: "#2da44e", Light.AMBER: "#d4920a", Light.RED: "#e5484d"}  # visible on white and on black
 MOST_ROWS = 40  # of a table
 LINE = "border-bottom:1px solid currentColor"
 CELL = "padding:2px 8px"
 
 
 def fragment(*pieces: str) -> str:
-    """All pieces that are not empty, one below the other."""
+    """All non-empty pieces, one below the other."""
     return f'<div class="hsnoise" style="max-width:60em;overflow-x:auto">{"".join(pieces)}</div>'
 
 
 def conclusion(of: Conclusion) -> str:
-    """A dot in the colour of its light, and the sentence."""
+    """A dot in the colour of the light, and the sentence."""
     dot = (
         f'<span role="img" aria-label="{of.light}" title="{of.light}" style="color:{COLOURS[of.light]}">&#9679;</span>'
     )
@@ -33,26 +33,26 @@ def conclusion(of: Conclusion) -> str:
 
 
 def paragraph(text: str) -> str:
-    """Text with its line breaks; nothing for none."""
+    """Text with its line breaks; empty for no text."""
     return f"<p>{escape(text).replace(chr(10), '<br>')}</p>" if text else ""
 
 
 def sentences(given: Iterable[str], title: str = "") -> str:
-    """A list below a title; nothing for no sentences."""
+    """A list below a title; empty for no sentences."""
     items = "".join(f"<li>{escape(one)}</li>" for one in given)
     return f"{paragraph(title)}<ul>{items}</ul>" if items else ""
 
 
 def details(summary: str, *pieces: str) -> str:
-    """What is shown only when asked for; nothing if all pieces are empty."""
+    """A block that opens on a click; empty if all pieces are empty."""
     inside = "".join(pieces)
     return f"<details><summary>{escape(summary)}</summary>{inside}</details>" if inside else ""
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[Any]], words: Collection[str] = ()) -> str:
-    """A table; columns under headings among `words` are aligned to the left, all others to the right.
+    """A table; columns whose heading is in `words` are aligned left, all others right.
 
-    Of more than MOST_ROWS rows the first are shown, and how many there are.
+    Longer tables are cut to their first MOST_ROWS rows, and the number of rows is stated.
     """
     rows = list(rows)
     left = [heading in words for heading in headings]
@@ -65,7 +65,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[Any]], words: Collect
 
 
 def printed(of: Table) -> str:
-    """A table as it is printed, with the same headings and cells; numbers to the right."""
+    """A table as printed, with the same headings and cells; numbers are aligned right."""
     headings = [str(column.header).replace("\n", " ") for column in of.columns]
     columns = [[str(cell) for cell in column.cells] for column in of.columns]
     is_left = [

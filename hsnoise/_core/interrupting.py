@@ -1,9 +1,8 @@
-"""Ctrl-C on the command line: one line and exit status 130, whatever is going on, and nothing is left half written.
+"""Ctrl-C on the command line: always one line of text and exit status 130, and no file is left half written.
 
-Python's own way, an exception out of the line that runs, does not do here. Imports and callbacks print it as a
-traceback, or lose it; a pool waits for its threads; compiled work is not left before it is done; and threads of XLA
-that still run while Python takes itself apart may crash. So the process is ended as it is, by a thread that no
-computation holds up.
+Python's KeyboardInterrupt is not enough here. Imports and callbacks print it as a traceback or lose it, a pool waits
+for its threads, compiled code runs to its end, and XLA threads that are still running while Python shuts down may
+crash. So a thread that no computation blocks ends the process at once.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 STATUS = 128 + signal.SIGINT
-CLEAN_LINE = "\r\x1b[2K\x1b[?25h"  # a line of progress is taken away, and the cursor that it hid comes back
+CLEAN_LINE = "\r\x1b[2K\x1b[?25h"  # erases the progress line and shows the cursor that it hid
 
 _unfinished: set[str] = set()
 _on_disk: list[str] = []
@@ -26,7 +25,7 @@ _ending = threading.Lock()
 
 @contextmanager
 def unfinished(path: str | os.PathLike) -> Iterator[None]:
-    """While the file at `path` is being written: it is removed, unless it was moved to its place; after Ctrl-C, too."""
+    """While the file at `path` is being written. On exit, also by Ctrl-C, it is removed unless it was moved away."""
     _unfinished.add(os.fspath(path))
     try:
         yield
@@ -37,17 +36,17 @@ def unfinished(path: str | os.PathLike) -> Iterator[None]:
 
 
 def on_disk(sentence: str) -> None:
-    """What Ctrl-C leaves from now on, in words; empty for nothing."""
+    """From now on, the message after Ctrl-C says what is left on disk: `sentence`, empty for nothing."""
     _on_disk[:] = [sentence] if sentence else []
 
 
 def message() -> str:
-    """What a user is told after Ctrl-C."""
+    """The message after Ctrl-C."""
     return "; ".join(["hsnoise: interrupted", *_on_disk])
 
 
 def end_at_once() -> None:
-    """From now on Ctrl-C ends this process, if it is that of the command line. Others are left as they are."""
+    """From now on Ctrl-C ends this process, if it runs the command line. Other processes are not changed."""
     ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
     if not _is_command() or ignored or threading.current_thread() is not threading.main_thread():
         return
@@ -60,7 +59,7 @@ def end_at_once() -> None:
 
 @contextmanager
 def as_exception() -> Iterator[None]:
-    """Within, Ctrl-C is a KeyboardInterrupt, for work that keeps what it has."""
+    """Inside this context Ctrl-C raises KeyboardInterrupt, for work that saves its state."""
     before = signal.getsignal(signal.SIGINT)
     if before is not _interrupted:
         yield
@@ -73,14 +72,14 @@ def as_exception() -> Iterator[None]:
 
 
 def nothing_left() -> None:
-    """All work is done: Ctrl-C while Python takes itself apart changes nothing."""
+    """All work is done: Ctrl-C while Python shuts down has no effect."""
     if signal.getsignal(signal.SIGINT) is _interrupted:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _is_command() -> bool:
     """Whether this process is `python -m hsnoise`, or the script `hsnoise`."""
-    if sys.argv[:1] == ["-m"]:  # Python is on its way to the module: argv does not name it yet
+    if sys.argv[:1] == ["-m"]:  # Python is still looking for the module: argv does not name it yet
         words = sys.orig_argv
         return "-m" in words and words[words.index("-m") + 1 :][:1] == ["hsnoise"]
     return bool(sys.argv) and os.path.splitext(os.path.basename(sys.argv[0]))[0] == "hsnoise"
@@ -97,15 +96,15 @@ def _interrupted(*_) -> None:
 
 
 def _end() -> None:
-    if not _ending.acquire(blocking=False):  # by the other thread, or by a second Ctrl-C
+    if not _ending.acquire(blocking=False):  # the other thread or an earlier Ctrl-C is at it
         return
     text = f"{CLEAN_LINE if os.isatty(2) else ''}{message()}\n"
-    with suppress(OSError):  # nobody may listen
+    with suppress(OSError):  # stderr may be closed
         os.write(2, text.encode())
     for path in tuple(_unfinished):
-        with suppress(OSError):  # it may not be begun yet
+        with suppress(OSError):  # it may not exist yet
             os.unlink(path)
     os._exit(STATUS)
 
 
-end_at_once()  # before all that is slow to import
+end_at_once()  # before the slow imports

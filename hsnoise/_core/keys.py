@@ -1,4 +1,4 @@
-"""Random keys: from a seed, or named after what they draw, so that one draw more leaves all others as they were."""
+"""Random keys: from a seed, or named after what they draw, so that adding a draw does not change the others."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import RandomKey, is_traced
 
-LARGEST_SEED = 2**32 - 1  # of larger ones JAX takes the lower 32 bits, unless it has 64
+LARGEST_SEED = 2**32 - 1  # without 64-bit types JAX keeps only the lower 32 bits
 
 
 def key_of(name: str, value: Any) -> RandomKey:
-    """`value` as a random key: a key of the new style or the old as it is, a whole number by `jax.random.key`.
+    """`value` as a random key: a key, new-style or old-style, is returned as it is; a whole number is made into one.
 
     Raises:
-        TypeError: it is neither, or several keys; ValueError: a number outside 0 to LARGEST_SEED. Of a traced number,
-            the value cannot be checked. `name` is that of the argument.
+        TypeError: it is neither, or several keys; ValueError: a number outside 0 to LARGEST_SEED (a traced number
+            cannot be checked). They name the argument, `name`.
     """
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ():
@@ -30,7 +31,9 @@ def key_of(name: str, value: Any) -> RandomKey:
     if is_traced(value) and shape == () and jnp.issubdtype(dtype, jnp.integer):
         return jax.random.key(value)
     seed = _whole(value) if shape in (None, ()) and not is_traced(value) else None
-    expected = f"{name}: expected a whole number from 0 to {LARGEST_SEED} or one random key, such as jax.random.key(0)"
+    expected = (
+        f"{named(name)}: expected a whole number from 0 to {LARGEST_SEED} or one random key, such as jax.random.key(0)"
+    )
     if seed is None:
         came = repr(value) if dtype is None else f"an array of {dtype} of shape {shape}"
         raise TypeError(f"{expected}, got {came}")
@@ -40,7 +43,7 @@ def key_of(name: str, value: Any) -> RandomKey:
 
 
 def _whole(value: Any) -> int | None:
-    """`value` as an int; None for what is no whole number, and for True and False, which are hardly meant as seeds."""
+    """`value` as an int; None if it is not a whole number, or True or False, which are hardly meant as seeds."""
     if isinstance(value, bool | np.bool_):
         return None
     try:
@@ -50,7 +53,7 @@ def _whole(value: Any) -> int | None:
 
 
 def named_key(key: RandomKey, name: str) -> RandomKey:
-    """The key that belongs to `name`, from `key`.
+    """The key for `name`, derived from `key`.
 
     The hash is CRC-32 of the UTF-8 name: unlike Python's `hash`, it is the same in every process.
     """

@@ -1,4 +1,4 @@
-"""Memory that is free is given back to the system."""
+"""Giving free memory back to the system."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from functools import cache
 
 
 def give_back_free_memory() -> None:
-    """Return what has been freed to the operating system, where the C library can (glibc): it keeps it otherwise.
+    """Return freed memory to the operating system, where the C library can (glibc); otherwise it keeps it.
 
-    Compiling leaves 150 MiB of it, between what stays, which what comes next would be laid on top of.
+    Compiling leaves 150 MiB of freed memory in fragments, which later allocations would not fill.
     """
     _trim()(0)
 

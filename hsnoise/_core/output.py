@@ -1,4 +1,4 @@
-"""What hsnoise writes: whole files or none, and frames in the formats that `hsnoise.load` reads."""
+"""Output files: written whole or not at all, and frames in the formats that `hsnoise.load` reads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_DENOMINATOR = 2**32 - 1  # of a rational number in a tag
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:
-    """Write a file so that a reader finds the old content or the new one, never half of it.
+    """Write a file so that a reader finds either the old or the new content, never half of it.
 
     Raises:
         OSError: the folder does not exist or cannot be written; an existing file is left as it was.
@@ -36,20 +36,20 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
 
 
 def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:
-    """Write a Matplotlib figure as PNG, all or nothing; keywords of `savefig`."""
+    """Write a Matplotlib figure as PNG, all or nothing; `keywords` go to `savefig`."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", **keywords)
     write_atomically(path, buffer.getvalue())
 
 
 def frames_file(suffix: str, counts: np.ndarray, metadata: Mapping[str, Any]) -> bytes:
-    """Content of a file of raw frames.
+    """The content of a file of raw frames.
 
     Args:
         suffix: one of `FRAME_FORMATS`. Only .npz holds several exposures and all metadata; .fits holds exposure,
             kind and Bayer order, .tif the exposure, .npy the counts alone.
         counts: DN, `[exposure, frame, row, column]`.
-        metadata: exposure_s [exposure], kind, cfa, and what else an .npz file of `hsnoise.load` may hold.
+        metadata: exposure_s [exposure], kind, cfa, and any other field that `hsnoise.load` reads from an .npz file.
 
     Raises:
         ValueError: an unknown suffix, or a format that cannot hold several exposures.

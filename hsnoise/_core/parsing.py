@@ -1,4 +1,4 @@
-"""How the command line is read: near names for wrong ones, an error in one line, exposures as they are written."""
+"""Parsing the command line: suggestions for wrong names, one-line errors, exposures with units."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **keywords: Any) -> None:
         super().__init__(allow_abbrev=False, **keywords)
 
-    def parse_known_args(self, args=None, namespace=None):  # both of the parser of all commands, and of the command's
+    def parse_known_args(self, args=None, namespace=None):  # called for the main parser and for the command's
         words = sys.argv[1:] if args is None else list(args)
         self._check_options(words)
         return super().parse_known_args(words, namespace)
@@ -33,14 +33,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         said = re.sub(r"invalid (int|float) value: (.*)", lambda m: f"expected {_KINDS[m[1]]}, got {m[2]}", message)
         if "required" in said:
-            said += f" ({self.prog} --help tells of them)"
+            said += f" ({self.prog} --help lists them)"
         self.exit(2, f"hsnoise: {said.removeprefix('argument ')}\n")
 
     def _check_options(self, words: Sequence[str]) -> None:
-        """Before all else: what is missing or wrong beside an option that is none would lead astray."""
+        """Reject unknown options first: other errors that they cause would mislead."""
         for word in words:
             if word == "--" or self._subparsers is not None and not word.startswith("-"):
-                return  # what follows is no option, or the command's
+                return  # the rest are not options, or belong to the command
             name = _OPTION.match(word)
             if name and name[0] not in self._option_string_actions:
                 self.error(f"unknown option {name[0]}{or_near(name[0], self._option_string_actions)}")
@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def or_near(word: str, known: Iterable[str]) -> str:
-    """A question for the known name that comes nearest, to stand behind an error; empty if none is near."""
+    """A question that suggests the nearest known name, to follow an error; empty if none is near."""
     near = difflib.get_close_matches(word.lower(), list(known), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -115,7 +115,7 @@ def minutes(text: str) -> float:
 
 
 def overscan(text: str) -> str | tuple[Any, Any]:
-    """auto, or spans of rows and columns, None for all."""
+    """auto, or spans of rows and columns; None: all of them."""
     if text == "auto":
         return text
     try:

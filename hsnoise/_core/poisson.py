@@ -1,12 +1,12 @@
-"""Poisson and normal numbers by inversion of one uniform number a pixel: no rejection, so that pixels run side by side.
+"""Poisson and normal numbers by inversion of one uniform number a pixel: no rejection, so pixels run in parallel.
 
-A pixel has two words of random bits, one block of Threefry (Salmon et al., "Parallel random numbers: as easy as 1, 2,
-3", SC 2011), which counts frames and pixels: they are the same however frames are batched or spread over devices.
+Each pixel has two words of random bits, one block of Threefry (Salmon et al., "Parallel random numbers: as easy as 1,
+2, 3", SC 2011) at a counter of frame and pixel: they do not depend on how frames are batched or sharded.
 
-Counts below SUM_TERMS come from the distribution function summed up, unrolled. Higher ones are a normal quantile put
-through Temme's uniform expansion (Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution
-function", ACM Trans. Math. Softw. 42, 2016), whose polynomials these are. They hold for deviations of the quantile from
--0.68 to 1.78 root means: 23 random bits leave that range only where the sum has the count already.
+Counts below SUM_TERMS come from an unrolled sum of the distribution function. Higher counts come from a normal quantile
+by Temme's uniform expansion, with the polynomials of Giles ("Algorithm 955: approximation of the inverse Poisson
+cumulative distribution function", ACM Trans. Math. Softw. 42, 2016). These are valid for quantiles from -0.68 to 1.78
+root means: with 23 random bits, quantiles outside belong to counts that the sum covers.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Regime = Literal["few", "many", "any"]  # what is known of means: all below FEW_BELOW, none below MANY_FROM, nothing
+Regime = Literal["few", "many", "any"]  # known of the means: all below FEW_BELOW; none below MANY_FROM; nothing
 ROTATIONS, PARITY = ((13, 15, 26, 6), (17, 29, 16, 24)), np.uint32(0x1BD11BDA)
 
-# Of means below FEW_BELOW, 23 bits reach no count of SUM_TERMS; of those from MANY_FROM, none below it.
+# With 23 bits, means below FEW_BELOW give only counts below SUM_TERMS, and means from MANY_FROM on none below it.
 FEW_BELOW, MANY_FROM, SUM_TERMS = 9.0, 80.0, 32
-SUM_END = 1 - 10 * 2.0**-24  # the sum of all terms, rounded at each, may stop short of 1 by somewhat less
+SUM_END = 1 - 10 * 2.0**-24  # the sum of all terms may fall short of 1 by slightly less, because each is rounded
 
 # Highest order first: r(s) = 1 + s + s^2 RATIO(s); the terms of order 1 and 1 / mean, by r - 1.
 RATIO = (
@@ -69,10 +69,10 @@ def regime_of(low: float, high: float) -> Regime:
 
 
 def poisson_of_bits(bits: jax.Array, mean: jax.Array, regime: Regime = "any") -> jax.Array:
-    """Poisson counts, float32, from random bits (uint32) of the pixels and their mean, or one for all.
+    """Poisson counts, float32, from each pixel's random bits (uint32) and mean (or one mean for all).
 
-    The first 23 bits choose one of the equal cells into which the unit interval is cut. The regime saves work; the
-    counts are the same in all that hold.
+    The first 23 bits choose one of the equal cells of the unit interval. The regime only saves work: every regime that
+    holds gives the same counts.
     """
     uniform, mean = _middle_of_cell(bits), mean.astype(jnp.float32)
     if regime == "few":
@@ -87,7 +87,7 @@ def poisson_of_bits(bits: jax.Array, mean: jax.Array, regime: Regime = "any") ->
 
 
 def normal_of_bits(bits: jax.Array) -> jax.Array:
-    """Standard normal numbers, float32, from random bits (uint32), by the first 23 of them."""
+    """Standard normal numbers, float32, from the first 23 of the random bits (uint32)."""
     return _normal_quantile(_middle_of_cell(bits))
 
 
@@ -105,7 +105,7 @@ def _normal_quantile(uniform):
 
 
 def _by_sum(uniform, mean):
-    """The count if it is below SUM_TERMS, else SUM_TERMS."""
+    """The count, or SUM_TERMS if it is not below that."""
     uniform = jnp.minimum(uniform, jnp.float32(SUM_END))
     power = below = jnp.exp(-mean)
     count = (uniform > below).astype(jnp.int32)

@@ -1,19 +1,29 @@
-"""The same work on many things, on all cores."""
+"""The same work on many items, on all cores."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+from threadpoolctl import ThreadpoolController
 
 
 def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:
-    """`function(argument)` for each, on all cores; results in order. NumPy and JAX let other threads work."""
+    """`function(argument)` for each, on all cores; results in order. NumPy and JAX release Python's lock."""
 
     def one(argument):
         result = function(argument)
         tick()
         return result
 
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+    # BLAS with threads of its own beside ours would wait for cores that are taken: ten times slower on small matrices.
+    with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         return list(pool.map(one, arguments))
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> ThreadpoolController:
+    """The thread pools of the libraries in this process; looking for them takes milliseconds."""
+    return ThreadpoolController()

@@ -1,4 +1,4 @@
-"""Array aliases and the colour filter array: what every layer above agrees on.
+"""Array types and the colour filter array, shared by every package.
 
 Shapes are named by jaxtyping: `frame`, `row`, `column`, `channel`. A channel is a colour; the two greens of a
 Bayer sensor are one channel.
@@ -12,8 +12,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt, UInt32
 
+from hsnoise._core.naming import named
+
 Scalar = Float[Array, ""]
-PerChannel = Float[Array, "*channel"]  # a scalar until the model spreads it over its channels
+PerChannel = Float[Array, "*channel"]  # a scalar until the model broadcasts it to its channels
 Frames = Float[Array, "frame row column"]
 FrameRows = Float[Array, "frame row channel"]  # one number for each row of each colour
 PixelMap = Float[Array, "1 row column"]
@@ -29,8 +31,8 @@ SHUTTERS = ("rolling", "global")
 class StatedGain:
     """The gain that a file's header states.
 
-    `source` quotes the header ("EGAIN 2.62 e-/DN"). `certain`: the keyword means electrons per DN and nothing else;
-    GAIN is often the number of a setting.
+    `source` quotes the header ("EGAIN 2.62 e-/DN"). `certain`: the keyword can only mean electrons per DN;
+    GAIN is often just the number of a setting.
     """
 
     value_dn_per_e: float
@@ -39,7 +41,7 @@ class StatedGain:
 
 
 def unit_in_words(unit: str) -> str:
-    """The unit as it stands behind a number: nothing for "1"."""
+    """The unit as written after a number: empty for "1"."""
     return "" if unit == "1" else unit
 
 
@@ -61,7 +63,7 @@ def channels_of(cfa: str) -> tuple[str, ...]:
         return ("mono",)
     if cfa in BAYER_CFAS:
         return ("R", "G", "B")
-    raise ValueError(f"cfa: expected 'mono' or one of {', '.join(BAYER_CFAS)}, got {cfa!r}.")
+    raise ValueError(f"{named('cfa')}: expected 'mono' or one of {', '.join(BAYER_CFAS)}, got {cfa!r}.")
 
 
 def cfa_tile(cfa: str) -> np.ndarray:
@@ -75,9 +77,9 @@ def cfa_tile(cfa: str) -> np.ndarray:
 def check_shutter(shutter: str) -> None:
     """Raise ValueError unless `shutter` is "rolling" or "global"."""
     if shutter not in SHUTTERS:
-        raise ValueError(f"shutter: expected 'rolling' or 'global', got {shutter!r}.")
+        raise ValueError(f"{named('shutter')}: expected 'rolling' or 'global', got {shutter!r}.")
 
 
 def is_traced(x) -> bool:
-    """True if `x` has no value yet, inside jit, vmap or grad; its values cannot be checked then."""
+    """True if `x` has no value yet (inside jit, vmap or grad) and cannot be checked."""
     return isinstance(x, jax.core.Tracer)

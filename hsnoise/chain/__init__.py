@@ -1,4 +1,4 @@
-"""From light to counts: photometry, the arrival of electrons, one effect after the other, effects as JSON.
+"""From light to counts: photometry, the arrival of electrons, the chain of effects, effects as JSON.
 
-May import `_core`, `frames` and `effects`. `hsnoise.model` is its door.
+May import `_core`, `frames` and `effects`. Its public module is `hsnoise.model`.
 """

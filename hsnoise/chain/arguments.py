@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.arguments import listed, window_of
+from hsnoise._core.naming import named
 from hsnoise._core.types import cfa_tile, is_traced
 
 
 def piece_of(window: Any, shape: tuple[int, ...], cfa: str) -> tuple[tuple[Any, Any], tuple[int, int]]:
-    """First row and column of frames of `shape` on a sensor, which may be traced, and its rows and columns.
+    """First row and column of frames of `shape` on a sensor (may be traced), and the sensor's rows and columns.
 
-    Raises TypeError, ValueError for a window that is none or does not hold the frames, or begins at another colour.
+    Raises TypeError or ValueError for an invalid window, one that does not fit the frames, or begins at another colour.
     """
     numbers = listed("window", window, "four whole numbers")
     found = window_of([0 if is_traced(n) else n for n in numbers], shape)
@@ -26,7 +27,7 @@ def piece_of(window: Any, shape: tuple[int, ...], cfa: str) -> tuple[tuple[Any, 
 
 
 def checked_light(clean, cfa: str):
-    """The array, and its lowest and highest value; NaN if it is traced."""
+    """The array and its lowest and highest values (NaN if traced)."""
     clean = clean if isinstance(clean, jax.Array) else np.asarray(clean)
     if not (jnp.issubdtype(clean.dtype, jnp.integer) or jnp.issubdtype(clean.dtype, jnp.floating)):
         raise TypeError(f"clean: expected real numbers (photoelectrons), got dtype {clean.dtype}.")
@@ -37,9 +38,9 @@ def checked_light(clean, cfa: str):
         raise ValueError(f"clean: expected even rows and columns for cfa {cfa}, got {clean.shape[-2:]}.")
     if is_traced(clean):
         return clean, np.nan, np.nan
-    # Broadcast axes (all frames alike, no light at all) hold one number each.
+    # A broadcast axis (all frames alike, no light at all) holds one number.
     some = clean if isinstance(clean, jax.Array) else clean[tuple(slice(1 if s == 0 else None) for s in clean.strides)]
-    with jax.ensure_compile_time_eval():  # inside jit, too, where arrays from outside have values
+    with jax.ensure_compile_time_eval():  # also inside jit, where arrays from outside have values
         low, high = float(some.min()), float(some.max())
     if not (low >= 0 and high <= float(np.finfo(np.float32).max)):
         raise ValueError(f"clean: expected finite photoelectrons >= 0, got values from {low} to {high}.")
@@ -47,9 +48,9 @@ def checked_light(clean, cfa: str):
 
 
 def checked_exposure(exposure_s):
-    """The exposure in seconds, one number >= 0."""
+    """The exposure in seconds, checked to be one number >= 0."""
     if np.ndim(exposure_s) != 0:
-        raise ValueError(f"exposure_s: expected one number of seconds, got shape {np.shape(exposure_s)}.")
+        raise ValueError(f"{named('exposure_s')}: expected one number of seconds, got shape {np.shape(exposure_s)}.")
     if not is_traced(exposure_s) and not 0 <= float(exposure_s) < np.inf:
-        raise ValueError(f"exposure_s: expected finite seconds >= 0, got {exposure_s}.")
+        raise ValueError(f"{named('exposure_s')}: expected finite seconds >= 0, got {exposure_s}.")
     return exposure_s

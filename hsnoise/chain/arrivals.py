@@ -1,9 +1,9 @@
-"""Shot noise, dark current and read noise in one step, and the derivative of what it draws.
+"""Shot noise, dark current and read noise in one step, and the derivatives of its draws.
 
-Shot noise and dark current are one Poisson number: sums of Poisson numbers are Poisson. A Poisson number by itself has
-no derivative by its mean. The sum x = Poisson(mean) + Normal(0, sigma^2) has a smooth distribution function G, and so
-the derivative -(dG/dtheta) / (dG/dx) at fixed G (implicit reparameterisation: Figurnov, Mohamed, Mnih, "Implicit
-reparameterization gradients", NeurIPS 2018), with which gradients of expectations are unbiased.
+A sum of Poisson numbers is Poisson, so shot noise and dark current are drawn as one. A Poisson number alone has no
+derivative with respect to its mean. The sum x = Poisson(mean) + Normal(0, sigma^2) has a smooth distribution function
+G, and hence the derivative -(dG/dtheta) / (dG/dx) at fixed G, which gives unbiased gradients of expectations (Figurnov,
+Mohamed, Mnih, "Implicit reparameterization gradients", NeurIPS 2018).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from jax.scipy.special import ndtr
 
 from hsnoise._core.poisson import Regime, normal_of_bits, pixel_words, poisson_of_bits
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects import DarkCurrent, ReadNoise, ShotNoise
-from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, param
+from hsnoise.effects import AbstractEffect, Capture, DarkCurrent, ReadNoise, ShotNoise, Stage, param
+from hsnoise.effects._base import PIXELS
 
 NODES, UNROLLED = 33, 11  # of the sum over numbers of electrons
 STIRLING_FROM = 20.0
@@ -29,9 +29,9 @@ HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
 class Arrivals(AbstractEffect):
-    """Shot noise and dark current in one, and the read noise if only what adds electrons comes between.
+    """Shot noise and dark current in one, with the read noise if only effects that add electrons come between.
 
-    sigma: rms read noise, e-; None if it is drawn later. regime: what is known of the mean electrons.
+    sigma: rms read noise, e-; None if it is drawn later. regime: the known range of the mean electrons.
     """
 
     name: ClassVar[str] = "arrivals"
@@ -45,7 +45,7 @@ class Arrivals(AbstractEffect):
         return self.expose(signal, signal.shape, capture, key=key)
 
     def expose(self, light: jax.Array, shape: tuple[int, ...], capture: Capture, *, key: RandomKey) -> Frames:
-        """Electrons [frame, row, column] from the expected photoelectrons of each pixel, or one number for all."""
+        """Electrons [frame, row, column] from each pixel's expected photoelectrons, or one number for all."""
         dark = self.rate * capture.exposure_s
         mean = light + (dark if capture.dark_current_scale is None else dark * capture.dark_current_scale)
         first, second = pixel_words(key, shape)
@@ -56,7 +56,7 @@ class Arrivals(AbstractEffect):
 
 
 def merged(effects: Sequence[AbstractEffect], regime: Regime) -> tuple[AbstractEffect, ...]:
-    """The effects with shot noise, dark current and read noise as one, where only what adds electrons is between."""
+    """The effects; shot noise, dark current and read noise merged if only effects that add electrons are between."""
     shot = next((i for i, effect in enumerate(effects) if isinstance(effect, ShotNoise)), None)
     if shot is None:
         return tuple(effects)
@@ -76,7 +76,7 @@ def merged(effects: Sequence[AbstractEffect], regime: Regime) -> tuple[AbstractE
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def poisson_plus_normal(regime: Regime, first, second, mean, sigma) -> jax.Array:
-    """Poisson(mean) + Normal(0, sigma^2) from two random words of each pixel."""
+    """Poisson(mean) + Normal(0, sigma^2) from two random words a pixel."""
     electrons = poisson_of_bits(first, mean, regime).astype(mean.dtype)
     return electrons + sigma * normal_of_bits(second).astype(mean.dtype)
 
@@ -92,8 +92,8 @@ def _derivative(regime, primals, tangents):
 def slopes(x: jax.Array, mean: jax.Array, sigma: jax.Array) -> tuple[jax.Array, jax.Array]:
     """dx / dmean and dx / dsigma of a draw x at fixed distribution function; 0 without read noise.
 
-    With weights w_k = P(k) phi((x - k) / sigma), the number k of electrons given x, they are the sums of
-    P(k) [Phi((x - k) / sigma) - Phi((x - k - 1) / sigma)] sigma, and of w_k (x - k) / sigma, over that of w_k.
+    With w_k = P(k) phi((x - k) / sigma), the weight of k electrons given x, they are the sums over k of
+    P(k) [Phi((x - k) / sigma) - Phi((x - k - 1) / sigma)] sigma and of w_k (x - k) / sigma, divided by that of w_k.
     """
     mean, has_noise = jnp.maximum(mean, 1e-20), sigma > 0
     sigma = jnp.where(has_noise, sigma, 1.0)
@@ -119,18 +119,18 @@ def slopes(x: jax.Array, mean: jax.Array, sigma: jax.Array) -> tuple[jax.Array, 
 
 
 def _between(low, high):
-    """Phi(high) - Phi(low), taken in the nearer tail."""
+    """Phi(high) - Phi(low), computed in the nearer tail."""
     right = low + high > 0
     return ndtr(jnp.where(right, -low, high)) - ndtr(jnp.where(right, -high, low))
 
 
 def _log_poisson(k, mean):
     low, high = jnp.minimum(k, STIRLING_FROM), jnp.maximum(k, STIRLING_FROM)
-    # Stirling's series, of (low + 4)! where the numbers are small.
+    # Stirling's series; for small k of (low + 4)!.
     z = low + 5
     log_factorial = (z - 0.5) * jnp.log(z) - z + HALF_LOG_2PI + 1 / (12 * z) - 1 / (360 * z**3)
     few = low * jnp.log(mean) - mean - log_factorial + jnp.log((z - 1) * (z - 2) * (z - 3) * (z - 4))
-    # Near the mean the large terms cancel: take their difference before it is rounded.
+    # Near the mean the large terms cancel: take their difference before rounding.
     deviance = high * jnp.log(high / mean) + (mean - high)
     many = -deviance - HALF_LOG_2PI - 0.5 * jnp.log(high) - 1 / (12 * high)
     return jnp.where(k < STIRLING_FROM, few, many)

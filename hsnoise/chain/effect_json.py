@@ -1,4 +1,4 @@
-"""An effect as JSON, numbers with their units."""
+"""Effects as JSON, numbers with their units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise.effects import AbstractEffect
-from hsnoise.effects._base import shortest
+from hsnoise.effects._parameters import shortest
 
 
 def effect_to_json(effect: AbstractEffect, channels: tuple[str, ...]) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from jaxtyping import Array
 
 from hsnoise._core.types import is_traced
 
-GREY = 0.2  # mean of linear light in ordinary pictures, of white
-PLANCK_J_S = 6.62607015e-34  # exact since the SI of 2019, as is the speed of light
+GREY = 0.2  # mean linear light of ordinary pictures, as a fraction of white
+PLANCK_J_S = 6.62607015e-34  # exact in the SI since 2019, like the speed of light
 LIGHT_SPEED_M_PER_S = 299_792_458.0
 LUMINOUS_EFFICACY_LM_PER_W = 683.0  # at 555 nm, where the eye is most sensitive
 WAVELENGTH_M = 555e-9
@@ -25,15 +25,15 @@ def photoelectrons_from_illuminance(
     pixel_area_m2: ArrayLike | None = None,
     pixel_pitch_m: ArrayLike | None = None,
 ) -> ArrayLike:
-    """Mean photoelectrons of a pixel, e-: I * A * t * eta / (683 lm/W * h c / 555 nm).
+    """Mean photoelectrons per pixel, e-: I * A * t * eta / (683 lm/W * h c / 555 nm).
 
-    All light is taken to be at 555 nm. Arguments are numbers or arrays that broadcast with each other.
+    All light is assumed to be at 555 nm. Arguments are numbers or arrays that broadcast with each other.
 
     Args:
         illuminance_lux: illuminance on the sensor (not on the scene), lux.
         exposure_s: exposure, s.
         quantum_efficiency: electrons per photon, above 0, at most 1.
-        pixel_area_m2: light-collecting area of a pixel, m^2; or else
+        pixel_area_m2: light-collecting area of a pixel, m^2; or instead
         pixel_pitch_m: pitch of square pixels, m.
 
     Raises:
@@ -58,7 +58,7 @@ def photoelectrons_from_illuminance(
 
 
 def scale_to_photoelectrons(image: ArrayLike, mean_e: ArrayLike) -> Array:
-    """Scale a linear image, or a whole clip at once, so that its average is `mean_e` photoelectrons.
+    """Scale a linear image or a whole clip so that its average is `mean_e` photoelectrons.
 
     Args:
         image: intensities of any scale >= 0, linear in light (undo a display's gamma first), any shape.
@@ -85,7 +85,7 @@ def _check_within(name: str, value: ArrayLike, high: float = np.inf) -> None:
 
 
 def linear_from_display(values: ArrayLike) -> Array:
-    """Linear light of display values 0 to 1 (sRGB, IEC 61966-2-1), 0 to 1; straight on below 0."""
+    """Linear light, 0 to 1, of display values 0 to 1 (sRGB, IEC 61966-2-1); linear below 0, too."""
     values = jnp.asarray(values, float)
     return jnp.where(values <= 0.04045, values / 12.92, ((jnp.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
 
@@ -98,7 +98,7 @@ def display_from_linear(light: ArrayLike) -> Array:
 
 
 def light_of_frames(frames: ArrayLike, channels: int) -> Array:
-    """Linear light [..., row, column, channel], white is 1, of display values (uint8) [..., row, column, 3].
+    """Linear light [..., row, column, channel] (1 is white) of display values (uint8) [..., row, column, 3].
 
     channels: 3, or 1 for grey.
     """

@@ -1,4 +1,4 @@
-"""What a signal goes through in the sensor: one effect after the other."""
+"""Passing a signal through the sensor's effects, one after the other."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from hsnoise._core.keys import named_key
 from hsnoise.chain.arrivals import Arrivals
 from hsnoise.effects import AbstractEffect, Stage
 
-SCALES = ("read_noise_scale", "dark_current_scale")  # how an effect shapes what another one draws
+SCALES = ("read_noise_scale", "dark_current_scale")  # the ways in which an effect scales what another draws
 
 
 def apply_by_effect(key, light, shape, effects, capture):
-    """What leaves the last effect, [frame, row, column]; each is compiled by itself."""
+    """The signal after the last effect, [frame, row, column]; each effect is compiled separately."""
     return reduce(lambda _, step: step[1], signals(key, light, shape, effects, capture), jnp.broadcast_to(light, shape))
 
 
 def signals(key, light, shape, effects, capture):
-    """Each effect and what leaves it, in turn, where `light` (e-, of `shape` or a scalar) falls on the sensor.
+    """Each effect in turn with the signal after it, where `light` (e-, of `shape` or a scalar) falls on the sensor.
 
-    Raises ValueError, naming the effect, for one that returns no signal of this shape.
+    Raises ValueError, naming the effect, if an effect does not return a signal of this shape.
     """
     scales = {what: _scale_of(what, key, effects, capture, shape) for what in SCALES}
     capture = dataclasses.replace(capture, **scales)
@@ -48,7 +48,7 @@ def signals(key, light, shape, effects, capture):
         if jnp.iscomplexobj(drawn):
             raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
         if jnp.issubdtype(drawn.dtype, jnp.integer) and effect.acts_at < Stage.DIGITAL:
-            drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; those after it expect floats
+            drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; the next effects expect floats
         signal = drawn
         yield effect, signal
 
@@ -57,8 +57,8 @@ apply_in_one = partial(jax.jit, static_argnums=2)(apply_by_effect)
 
 
 def apply_fenced(key, light, shape, effects, capture):
-    """As `apply_in_one`, within a larger program. On CPUs XLA would merge the draws with what is done before and after
-    (mosaic, demosaicking), and compute them slowly and several times: as the branch of a condition they stay whole.
+    """As `apply_in_one`, inside a larger program. On CPUs XLA would fuse the draws with the steps before and after
+    (mosaic, demosaicking) and compute them slowly and repeatedly; as a branch of a condition they stay separate.
     """
 
     def draw(key, light, effects, capture):
@@ -73,12 +73,12 @@ def apply_fenced(key, light, shape, effects, capture):
 
 
 def may_scale(what: str, effect: AbstractEffect) -> bool:
-    """Whether an effect shapes what another one draws; `what` of SCALES."""
+    """Whether an effect scales what another draws; `what` is one of SCALES."""
     return getattr(type(effect), what) is not getattr(AbstractEffect, what)
 
 
 def _scale_of(what, key, effects, capture, shape):
-    """Product of the factors of all effects on the read noise or dark current of each pixel; None: 1."""
+    """Product of all effects' factors on the read noise or dark current of each pixel; None: 1."""
     factors = [_factor(what, key, effect, capture, shape) for effect in effects if may_scale(what, effect)]
     factors = [factor for factor in factors if factor is not None]
     return reduce(jnp.multiply, factors) if factors else None

@@ -1,4 +1,4 @@
-"""The command line: options, progress, what is printed and what is written.
+"""The command line: options, progress, printed pages and written files.
 
-May import everything. `hsnoise.cli.main` is the door.
+May import everything. `hsnoise.cli.main` is the entry point.
 """

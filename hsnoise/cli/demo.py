@@ -1,4 +1,4 @@
-"""The command `hsnoise demo`: what is hidden in simulated frames is found, or what a user's own frames hold."""
+"""The command `hsnoise demo`: find an effect hidden in simulated frames, or examine a user's own frames."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from hsnoise.simulation import cameras
 EXPOSURES_S, FRAMES, SHAPE, SEED = (0.05, 0.1, 0.2, 0.4), 8, (96, 160), 0
 HIDDEN = RowNoise(1.5)
 MINUTES = 5.0  # for frames of a user's own
-OFF_BY = """\
-off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read
-noise are off together: their ratios are known better than themselves."""
+OFF_BY = (
+    "off by: (value - truth) / standard error; beyond 3 only by rare chance. Gains, dark current and read",
+    "noise are off together: their ratios are known better than themselves.",
+)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -34,7 +35,7 @@ def run(args: argparse.Namespace) -> None:
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
     if args.real:
         if args.data:
-            raise ValueError("--real: takes the frames that come with hsnoise, so it does not go with --data")
+            raise ValueError("--real: uses the frames that come with hsnoise, so it does not go with --data")
         night = str(examples.st8(args.out / "night"))
         print(f"The frames of an SBIG ST-8, an astronomical CCD camera, are in {night}. So is their licence: CC0.")
         args.data = [night]
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> None:
 def _on_frames(
     args: argparse.Namespace, stack: FrameStack, source: dict[str, Any], limits: dict[str, float | None]
 ) -> None:
-    """The loop on frames whose truth nobody knows; a fit alone where they do not determine the gain."""
+    """The loop on frames without a known truth; only a fit if they do not determine the gain."""
     stack.check()
     args.out.mkdir(parents=True, exist_ok=True)
     print(stack)
@@ -68,23 +69,23 @@ def _improved(
     truth: NoiseModel | None = None,
 ) -> None:
     page = args.out / "report.html"
-    print(f"Fitting them, finding what the model lacks, and fitting again: a few minutes. {page}, for a", flush=True)
-    print("browser, tells the story so far, with figures, after each step.", flush=True)
+    print(f"Fitting them, finding what the model lacks, and fitting again: a few minutes. Open {page}", flush=True)
+    print("in a browser for the story so far, with figures; it is updated after each step.", flush=True)
     story = improve_with_progress(stack, SEED, args.out, source, page=page, **limits)
     foot = [f"Written to {args.out}/: {', '.join([*keep(story, args.out, source), 'story.png'])}"]
     write_figure(args.out / "story.png", story.plot())
     report.write_report(page, story, stack, files=source.get("files", ()), seed=SEED)
     if truth is not None:
-        foot = [*OFF_BY.splitlines(), *foot]
-        foot.append(f"Hidden in these frames was {HIDDEN.name}. They are in {args.out / 'capture.npz'}.")
-    foot.append(f"All of this is on one page, with figures, for a browser: {page}")
+        foot = [*OFF_BY, *foot]
+        foot.append(f"The hidden effect was {HIDDEN.name}. The frames are in {args.out / 'capture.npz'}.")
+    foot.append(f"All of this is on one page with figures; open it in a browser: {page}")
     added = ", ".join(step.added for step in story.steps if step.added) or "nothing"
     foot.append(f"Added: {added}. Error before {story.errors[0]:.1f}, after {story.errors[-1]:.1f}.")
     tell(page_of_story(story, truth), foot, args.verbose)
 
 
 def simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
-    """Darks with a hidden effect, kept as capture.npz, and the model that they are drawn from."""
+    """Darks with a hidden effect, saved as capture.npz, and the model they are drawn from."""
     truth = cameras.canon_5d3().add(HIDDEN)
     rows, columns = SHAPE
     print(f"Simulating {len(EXPOSURES_S) * FRAMES} dark frames of {rows} x {columns} pixels ...", flush=True)

@@ -1,4 +1,4 @@
-"""The command `hsnoise enhance`: a noisy video in, an enhanced one out."""
+"""The command `hsnoise enhance`: enhance a noisy video."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, enhance
 
-RANGES = {"--brighten": (1e-3, 1e3), "--rate": (0.01, 1000.0)}
-CLEAN = 1 / 16  # of the least variance that a network was trained on: less is another kind of video
-BLOCK = 8  # pixels, so many that most of a picture is even within them
+RANGES = {"brighten": (1e-3, 1e3), "rate": (0.01, 1000.0)}
+CLEAN = 1 / 16  # of the smallest variance in training: with less, the video is of another kind
+BLOCK = 8  # pixels; most of a picture is uniform within a block
 
 
 def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
@@ -39,8 +39,8 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     if args.weights is None:
         low, high = about["white_e"]
         print(
-            f"Weights that come with hsnoise, trained for {about['camera']}, white of {low:.2g} to {high:.2g}"
-            " photoelectrons; --weights takes others",
+            f"Using the weights that come with hsnoise, trained for {about['camera']}, white of {low:.2g} to {high:.2g}"
+            " photoelectrons; choose others by --weights",
             file=sys.stderr,
         )
     _check_network(args, net, about, camera)
@@ -56,8 +56,8 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """SIGTERM ends what is within as an exception does: else a file that is half written would stay."""
-    if threading.current_thread() is not threading.main_thread():  # Python hands signals to no other
+    """SIGTERM raises an exception inside this context; otherwise a half-written file would remain."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
         yield
         return
     before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -68,7 +68,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """What can be told before anything is read."""
+    """Checks that need no files to be read."""
     if args.out.suffix.lower() not in WRITTEN or args.out.is_dir():
         raise ValueError(f"OUT: expected a video file, ending in {', '.join(WRITTEN)}, got {args.out}")
     if not args.out.parent.is_dir():
@@ -76,12 +76,12 @@ def _check(args: argparse.Namespace) -> None:
     if args.out.exists() and Path(args.video).exists() and args.out.samefile(args.video):
         raise ValueError(f"OUT: expected another file than IN, got {args.out}, which would be lost")
     for option, (low, high) in RANGES.items():
-        value = getattr(args, option.removeprefix("--"))
+        value = getattr(args, option)
         if not low <= value <= high:
-            raise ValueError(f"{option}: expected {low:g} to {high:g}, got {value:g}")
-    for option in ("--exposure", "--cfa"):
-        if args.camera is None and getattr(args, option.removeprefix("--")) is not None:
-            raise ValueError(f"{option}: goes with --camera, the camera of raw frames")
+            raise ValueError(f"--{option}: expected {low:g} to {high:g}, got {value:g}")
+    for option in ("exposure", "cfa"):
+        if args.camera is None and getattr(args, option) is not None:
+            raise ValueError(f"--{option}: goes with --camera, the camera of raw frames")
 
 
 def _check_network(args: argparse.Namespace, net: STLSTM, about: dict[str, Any], camera: NoiseModel | None) -> None:
@@ -94,15 +94,15 @@ def _check_network(args: argparse.Namespace, net: STLSTM, about: dict[str, Any],
 
 
 def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.ndarray]:
-    """The frames of light, with a warning if the first is far cleaner than any that the network was trained on.
+    """The frames of light, with a warning if the first is far cleaner than the network's training frames.
 
-    Those have at least the shot noise of the brightest scene, in every part of a frame. What neighbours differ by is
-    noise and picture: more than the noise, never less.
+    Training frames have at least the shot noise of the brightest scene everywhere. Differences of neighbours contain
+    noise and picture, so they are never less than the noise.
     """
     for number, frame in enumerate(frames):
         if number == 0 and "white_e" in about and _is_clean(frame, max(about["white_e"])):
             warnings.warn(
-                f"IN: has far less noise than what the weights were trained for, white of up to"
+                f"IN: has far less noise than the weights were trained for, white of up to"
                 f" {max(about['white_e']):.3g} photoelectrons; the result may be worse than the input",
                 stacklevel=2,
             )
@@ -110,7 +110,7 @@ def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.n
 
 
 def _is_clean(frame: np.ndarray, white_e: float) -> bool:
-    """Whether most blocks of light [row, column, channel] lack the shot noise of a white of so many photoelectrons."""
+    """Whether most blocks of light [row, column, channel] lack the shot noise of a white of `white_e` electrons."""
     rows, columns = (n - n % BLOCK for n in frame.shape[:2])
     blocks = frame[:rows, :columns].reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK, -1)
     variance = np.mean(np.diff(blocks, axis=3) ** 2, (1, 3, 4)) / 2
@@ -129,9 +129,9 @@ def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
 
 
 def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndarray]:
-    """Light of raw frames, of a white that makes the first frame of ordinary brightness."""
+    """Light of raw frames, with white chosen such that the first frame has ordinary brightness."""
     stack = load(args.video, cfa=args.cfa, kind="flat", exposure_s=args.exposure)
-    if stack.n_exposures > 1:  # they are in the order of their exposures, not of time
+    if stack.n_exposures > 1:  # they are sorted by exposure, not by time
         raise ValueError(f"IN: expected frames of one exposure, got {', '.join(f'{t:g}' for t in stack.exposure_s)} s")
     camera = _as_taken(args, camera, stack)
     white_e = None
@@ -148,8 +148,8 @@ def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndar
 
 
 def _as_taken(args: argparse.Namespace, camera: NoiseModel, stack: FrameStack) -> NoiseModel:
-    """The camera with the exposure of the frames, and with their Bayer order and black level where those are known."""
-    # Gains belong to colours; the order of these in the array is that of the frames.
+    """The camera with the frames' exposure, and their Bayer order and black level where known."""
+    # Gains belong to colours; the frames determine the order of the colours.
     cfa = args.cfa or (camera.cfa if stack.cfa == "mono" else stack.cfa)
     if channels_of(cfa) != camera.channels:
         raise ValueError(f"--camera: a model of {camera.cfa}, but the frames of {args.video} are {cfa}")

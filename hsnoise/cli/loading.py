@@ -1,4 +1,4 @@
-"""Arguments of the command line to captures and models."""
+"""Loading captures and models from command-line arguments."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from typing import Any
 
 import numpy as np
 
-import hsnoise.frames.io
+from hsnoise._core.naming import as_options, named
 from hsnoise._core.parsing import or_near
 from hsnoise.cli.options import CAMERAS
+from hsnoise.frames.io.load import load
 from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 
 
 def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
-    """Darks, and flats if there are any, as one stack."""
+    """Darks, and flats if any, as one stack."""
     options = {
         "cfa": args.cfa,
         "black_level": _one_or_list(args.black_level),
@@ -34,15 +35,13 @@ def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
         for group in groups:
             _tell_exposures(group)
     if args.flats:
-        try:
+        with as_options({"path": "--flats", "exposure_s": "--flats-exposure"}):
             groups += _captures(args.flats, exposure_s=_one_or_list(args.flats_exposure), kind="flat", **options)
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"--flats: {str(error).removeprefix('path: ')}") from error
     return groups[0] if len(groups) == 1 else FrameStack.join(*groups)
 
 
 def same_capture(args: argparse.Namespace) -> str:
-    """The words of a command line that load the capture of `args` once more."""
+    """Command-line words that load the capture of `args` again."""
     words = [*args.paths]
     for name in ("exposure", "kind", "cfa", "black_level", "white_level", "shutter", "row_axis", "roi", "overscan"):
         value = getattr(args, name)
@@ -54,7 +53,7 @@ def same_capture(args: argparse.Namespace) -> str:
 
 
 def _in_words(value: Any) -> str:
-    """An option's value as it is typed: numbers and spans with commas."""
+    """An option's value as a user types it: numbers and spans with commas."""
     if isinstance(value, tuple | list):
         spans = all(isinstance(one, tuple) for one in value)
         ends = [":".join("" if end is None else str(end) for end in one) for one in value] if spans else value
@@ -63,7 +62,7 @@ def _in_words(value: Any) -> str:
 
 
 def _tell_exposures(stack: FrameStack) -> None:
-    """Which files the exposures of the command line were given to, with the mean of the first frame of each."""
+    """Print the files to which the command line's exposures were assigned, with the mean of each first frame."""
     for i, (counts, exposure_s) in enumerate(zip(stack.counts, stack.exposure_s, strict=True)):
         if isinstance(counts, LazyFrames):
             more = f" and {len(counts.names) - 1} more" if len(counts.names) > 1 else ""
@@ -72,11 +71,11 @@ def _tell_exposures(stack: FrameStack) -> None:
 
 
 def _captures(paths: list[str], **options: Any) -> list[FrameStack]:
-    """Several files or folders are one capture; several patterns, or folders with exposures of their own, one each."""
+    """One capture from several files or folders; one each from patterns, or from folders with their own exposures."""
     is_one = all(Path(path).exists() for path in paths) and np.ndim(options["exposure_s"]) == 0
     if len(paths) > 1 and (is_one or all(Path(path).is_file() for path in paths)):
-        return [hsnoise.io.load(paths, **options)]
-    return [hsnoise.io.load(path, **options) for path in paths]
+        return [load(paths, **options)]
+    return [load(path, **options) for path in paths]
 
 
 def model_of(name: str, argument: str = "model") -> NoiseModel:
@@ -85,7 +84,7 @@ def model_of(name: str, argument: str = "model") -> NoiseModel:
         return CAMERAS[name]()
     if not Path(name).is_file():
         expected = f"expected a model.json or one of {', '.join(CAMERAS)}"
-        raise ValueError(f"{argument}: {expected}, and there is no {name}{or_near(name, CAMERAS)}")
+        raise ValueError(f"{named(argument)}: {expected}, and there is no {name}{or_near(name, CAMERAS)}")
     return NoiseModel.load(name)
 
 

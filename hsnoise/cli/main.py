@@ -13,7 +13,8 @@ from rich.console import Console
 import hsnoise
 from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
-from hsnoise._core.arguments import counter
+from hsnoise._core.events import Event, counter
+from hsnoise._core.naming import as_options
 from hsnoise._core.output import write_figure
 from hsnoise.cli import demo as _demo
 from hsnoise.cli import enhance as _enhance
@@ -24,7 +25,6 @@ from hsnoise.cli.progress import busy, fit_with_progress
 from hsnoise.cli.results import check_folder, improve_with_progress, keep, write_results
 from hsnoise.cli.telling import (
     Page,
-    in_options,
     page_of_comparison,
     page_of_diagnosis,
     page_of_fit,
@@ -34,31 +34,49 @@ from hsnoise.cli.telling import (
 )
 from hsnoise.criticism import Comparison
 from hsnoise.criticism.compare import DRAWS
+from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
-from hsnoise.simulation.draws import check_fits, part_of
+from hsnoise.simulation.draws import check_fits
+from hsnoise.simulation.portion import Portion
 
 MEANING = """\
-One electron adds `gain` DN to a count; a pixel collects `dark_current.rate` electrons per second without light, and \
-reading it adds noise of `read_noise.sigma` electrons. From row to row, and anew in each frame, the gain fluctuates by \
-`row_gain.sigma` of itself (streaks), in white noise if the exponent is 0, in 1/f noise if it is 1. What the standard \
-errors do not say: whether the model is right."""
-ASSUMED = 4  # sentences on the capture that are told before the work
-LOOK = dict.fromkeys(("ml", "line", "transfer"), "Look at the residuals in histograms.png, and run {}")
-LOOK["synthetic"] = "Run {}, which draws them. Figures of the fit would lack the added effects, and are left out."
-BROKEN_PIPE = 128 + 13  # as a shell has it of those whom SIGPIPE ended
+One electron adds `gain` DN to a count. A pixel collects `dark_current.rate` electrons per second without light, and \
+reading it adds noise of `read_noise.sigma` electrons. The gain fluctuates from row to row and from frame to frame by \
+`row_gain.sigma` of itself (streaks): white noise if the exponent is 0, 1/f noise if it is 1. The standard errors \
+do not say whether the model is right."""
+ASSUMED = 4  # assumptions about the capture that are printed before the work
+LOOK = dict.fromkeys(Method, "Look at the residuals in histograms.png, and run {}")
+LOOK[Method.SYNTHETIC] = "Run {}, which draws them. Figures of the fit are left out: they would lack the added effects."
+# Arguments of the library, and what its sentences call them here.
+OPTIONS = {
+    "exposure_s": "--exposure",
+    "black_level": "--black-level",
+    "white_level": "--white-level",
+    "cfa": "--cfa",
+    "roi": "--roi",
+    "overscan": "--overscan",
+    "shutter": "--shutter",
+    "kind": "--kind",
+    "flats": "--flats",
+    "report": "--report",
+    "model": "--model",
+    "params": "--model",
+    "seed": "--seed",
+}
+BROKEN_PIPE = 128 + 13  # a shell's exit code for a process ended by SIGPIPE
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, 1 if a capture makes no fit, or 2 after an error, told in a sentence.
+    """Run a command. Exit codes: 0; 1 if a fit of the capture makes no sense; 2 after an error, printed in a sentence.
 
-    141 if nobody reads what it prints, 130 after Ctrl-C.
+    141 if the reader of the output is gone; 130 after Ctrl-C.
     """
     _interrupting.on_disk("")
     try:
         try:
             return _run(argv)
         finally:
-            sys.stdout.flush()  # a reader that is gone is noted here, not while Python ends
+            sys.stdout.flush()  # notice a closed pipe here, not while Python shuts down
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
@@ -77,10 +95,10 @@ def _run(argv: list[str] | None) -> int:
         return 2
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), as_options(OPTIONS):
             warnings.simplefilter("once")
             warnings.showwarning = lambda message, *_, **__: console.print(
-                f"Note: {in_options(str(message))}.", style="yellow", markup=False
+                f"Note: {message}.", style="yellow", markup=False
             )
             return RUN[args.command](args) or 0
     except BrokenPipeError:
@@ -95,7 +113,7 @@ def _run(argv: list[str] | None) -> int:
 def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return in_options(" ".join(str(error).split()))
+    return " ".join(str(error).split())
 
 
 # Commands
@@ -104,7 +122,7 @@ def _sentence(error: Exception) -> str:
 def _inspect(args: argparse.Namespace) -> int:
     stack = load_capture(args.paths, args)
     with busy("Looking at the frames", of="frame") as say:
-        found = hsnoise.inspect(stack, progress=counter(say, "Looking at the frames"))
+        found = hsnoise.inspect(stack, progress=counter(say, Event("Looking at the frames")))
     tell(page_of_inspection(found), verbose=args.verbose)
     return 0 if found.fit_makes_sense else 1
 
@@ -112,7 +130,7 @@ def _inspect(args: argparse.Namespace) -> int:
 def _fit(args: argparse.Namespace) -> None:
     check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
-    args.out.mkdir(parents=True, exist_ok=True)  # before the long work, so that it cannot be in vain
+    args.out.mkdir(parents=True, exist_ok=True)  # fail before the long work
     fit = fit_with_progress(stack, args.method, model, args.pixels)
     written = write_results(fit, args.out, {"files": args.paths})
     if args.maps is not None:
@@ -135,12 +153,12 @@ def _compare(args: argparse.Namespace) -> None:
 def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args)
-    part_of(stack)  # flats alone are no capture to diagnose: said before the fit
+    Portion.of(stack)  # rejects a capture of flats alone before the fit
     args.out.mkdir(parents=True, exist_ok=True)
     fitted = fit_with_progress(stack, args.method) if args.model is None else model_of(args.model)
-    text = "Drawing every effect that may be missing"
+    text = "Drawing each effect that may be missing"
     with busy(text) as say:
-        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, text))
+        found = hsnoise.diagnose(fitted, stack, seed=args.seed, progress=counter(say, Event(text)))
     more: dict[str, Any] = {"fit": fitted}
     if args.report is not None:
         more["comparison"] = _compared(getattr(fitted, "params", fitted), stack, args.seed)
@@ -162,12 +180,12 @@ def _improve(args: argparse.Namespace) -> None:
 
 
 def _load(args: argparse.Namespace) -> FrameStack:
-    """The capture, checked; what was assumed about it is printed."""
+    """The capture, checked; prints what was assumed about it."""
     stack = load_capture(args.paths, args)
     stack.check()
     shown = stack.assumed if args.verbose else stack.assumed[:ASSUMED]
     for sentence in shown:
-        print(f"- {in_options(sentence)}", file=sys.stderr)
+        print(f"- {sentence}", file=sys.stderr)
     if len(stack.assumed) > len(shown):
         print(f"- {len(stack.assumed) - len(shown)} more assumptions: --verbose", file=sys.stderr)
     return stack
@@ -176,21 +194,21 @@ def _load(args: argparse.Namespace) -> FrameStack:
 def _compared(model, stack: FrameStack, seed: int) -> Comparison:
     text = "Drawing from the model"
     with busy(text) as say:
-        return hsnoise.compare(model, stack, seed=seed, progress=counter(say, text, DRAWS))
+        return hsnoise.compare(model, stack, seed=seed, progress=counter(say, Event(text), DRAWS))
 
 
 def _show(
     args: argparse.Namespace, found, page: Page, figure: str, stack: FrameStack, foot: tuple[str, ...] = (), **more: Any
 ) -> None:
-    """Draw the figure of a finding, write its report, and print its page."""
+    """Draw the figure of a result, write its report, and print its page."""
     write_figure(args.out / figure, found.plot())
     _write_report(args, found, stack, **more)
-    reported = [] if args.report is None else [f"Reported in {args.report}"]
-    tell(page, [*foot, f"Drawn in {args.out / figure}", *reported], args.verbose)
+    reported = [] if args.report is None else [f"Report: {args.report}"]
+    tell(page, [*foot, f"Figure: {args.out / figure}", *reported], args.verbose)
 
 
 def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords: Any) -> None:
-    """Write the page that --report asks for, if it does."""
+    """Write the page if --report asks for it."""
     if args.report is None:
         return
     with busy("Writing the report"):
@@ -201,7 +219,7 @@ def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Before long work, so that it cannot be in vain."""
+    """Raise errors about outputs before the long work."""
     check_folder(args.out)
     if args.report is not None:
         report.check_path(args.report, made=args.out)

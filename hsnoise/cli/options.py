@@ -1,4 +1,4 @@
-"""What the commands of the command line take."""
+"""Options of the command line."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ CAMERAS = {"canon_5d3": canon_5d3, "grasshopper3": grasshopper3}
 
 
 def parser() -> Parser:
-    """The parser of all commands; `command` names which, or is None."""
+    """The parser of all commands; its result's `command` names one, or is None."""
     top = Parser(
         prog="hsnoise",
-        description="Measure the noise of a camera from dark frames (taken with the lens cap on), and make frames with "
+        description="Measure the noise of a camera from dark frames (taken with the lens cap on), and draw frames with "
         "the same noise. New here? Run: hsnoise demo",
     )
     top.add_argument("--version", action="version", version=_versions())
@@ -34,14 +34,14 @@ def parser() -> Parser:
     _enhance_arguments(commands)
     training_arguments(commands)
     for name in ("demo", "inspect", "fit", "compare", "diagnose", "improve"):
-        commands.choices[name].add_argument("--verbose", action="store_true", help="print all that was found")
+        commands.choices[name].add_argument("--verbose", action="store_true", help="print all results")
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return top
 
 
 def _versions() -> str:
-    """What a report of an error should name."""
+    """The versions that an error report should name."""
     libraries = {"jax": "JAX", "numpy": "NumPy", "equinox": "Equinox", "optimistix": "Optimistix"}
     found = [f"Python {platform.python_version()}", *(f"{name} {version(key)}" for key, name in libraries.items())]
     return f"hsnoise {version('hsnoise')} ({', '.join(found)})"
@@ -52,13 +52,11 @@ def _demo_arguments(commands: Any) -> None:
         "Simulate a small dark capture of a Canon 5D Mark III at ISO 25600 with an effect hidden in it, fit it, find "
         "what is missing, add it, and show the fit beside the truth. Takes a few minutes."
     )
-    demo = commands.add_parser(
-        "demo", help="see what hsnoise does, on simulated or on your own frames", description=text
-    )
+    demo = commands.add_parser("demo", help="see what hsnoise does, on simulated frames or your own", description=text)
     demo.add_argument(
-        "--data", nargs="+", metavar="PATH", help="take these dark frames instead: a folder, files or a pattern"
+        "--data", nargs="+", metavar="PATH", help="use these dark frames instead: a folder, files or a pattern"
     )
-    demo.add_argument("--real", action="store_true", help="take the frames of a real CCD camera that come with hsnoise")
+    demo.add_argument("--real", action="store_true", help="use the frames of a real CCD camera that come with hsnoise")
     demo.add_argument("--out", type=Path, default=Path("hsnoise-demo"), metavar="FOLDER", help="default: hsnoise-demo")
     _limit_arguments(demo)
     _capture_arguments(demo)
@@ -66,38 +64,38 @@ def _demo_arguments(commands: Any) -> None:
 
 def _inspect_arguments(commands: Any) -> None:
     text = (
-        "Look at a capture before any fit, in seconds: what its frames are, which are odd, their noise budget, what "
-        "can and what cannot be determined from them, and the next capture worth taking. Exits with 1 where a fit "
-        "makes no sense."
+        "Check a capture before any fit, in seconds: what its frames are, which are odd, their noise budget, what "
+        "can and cannot be determined from them, and the next capture worth taking. Exits with 1 if a fit makes no "
+        "sense."
     )
-    inspect = commands.add_parser("inspect", help="see what frames are and what they can tell", description=text)
+    inspect = commands.add_parser("inspect", help="see what frames are and what they can show", description=text)
     inspect.add_argument("paths", nargs="+", metavar="PATH", help="a folder with bias, darks, flats; files; a pattern")
     _capture_arguments(inspect)
 
 
 def _fit_arguments(commands: Any) -> None:
     text = (
-        "Fit the noise model to dark frames. Takes raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files, all at one ISO, "
+        "Fit the noise model to dark frames. Reads raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files, all at one ISO, "
         "best at several exposures. Writes model.json, table.csv and figures to a folder."
     )
     fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
     fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
     fit.add_argument(
-        "--model", help="model.json whose effects are fitted, those of a story, say (default: the paper's model)"
+        "--model", help="model.json whose effects are fitted, such as that of `improve` (default: the paper's model)"
     )
     _method_argument(fit)
     fit.add_argument(
         "--pixels",
         choices=("auto", "alike", "differ"),
         default="auto",
-        help="whether pixels are pooled as if alike, or fitted each by itself (default: a test on the frames decides)",
+        help="whether to pool pixels as if alike, or to fit each by itself (default: a test on the frames decides)",
     )
     fit.add_argument(
         "--maps",
         type=Path,
         metavar="FILE",
-        help="write offset, dark current, noise and flags of each pixel: .fits, .npz",
+        help="write offset, dark current, noise and flags of each pixel to a .fits or .npz file",
     )
     _capture_arguments(fit)
 
@@ -106,8 +104,8 @@ def _loop_arguments(commands: Any) -> None:
     compare = commands.add_parser(
         "compare",
         help="see where a model fails to describe dark frames",
-        description="Compare a model with dark frames: every statistic of the frames against the model's own samples. "
-        "An error of 1 means: as close as those are.",
+        description="Compare a model with dark frames: statistics of the frames with those of the model's own samples. "
+        "An error of 1 means that the frames are as close as those samples.",
     )
     diagnose = commands.add_parser(
         "diagnose",
@@ -138,17 +136,17 @@ def _loop_arguments(commands: Any) -> None:
         parser.add_argument(
             "--report", type=Path, metavar="FILE", help="write one page of HTML, figures included: report.html"
         )
-        parser.add_argument("--seed", type=count, default=0, help="of the model's samples (default 0)")
+        parser.add_argument("--seed", type=count, default=0, help="seed of the model's samples (default 0)")
         if name == "improve":
             _limit_arguments(parser)
         _capture_arguments(parser)
 
 
 def _limit_arguments(parser: argparse.ArgumentParser) -> None:
-    """When the loop ends."""
-    text = "end after so long, with what there is then; the first fit is finished in any case"
+    """Limits of the loop."""
+    text = "stop after this time and keep the result so far; the first fit is always finished"
     parser.add_argument("--max-minutes", type=minutes, metavar="M", help=text)
-    parser.add_argument("--max-steps", type=count, metavar="N", help="add no more effects than this")
+    parser.add_argument("--max-steps", type=count, metavar="N", help="add at most N effects")
 
 
 def _method_argument(parser: argparse.ArgumentParser) -> None:
@@ -162,7 +160,7 @@ def _method_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def _capture_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what the files do not say", "each overrides what the files say")
+    group = parser.add_argument_group("what the files do not state", "each option overrides the files")
     group.add_argument(
         "--exposure",
         type=list_of_seconds,
@@ -176,7 +174,7 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--shutter",
         choices=SHUTTERS,
-        help="how the sensor is read (default: rolling); the gain of rows fluctuates as 1/f then, else white",
+        help="how the sensor is read (default: rolling); row gains fluctuate as 1/f if rolling, else as white noise",
     )
     group.add_argument(
         "--row-axis",
@@ -185,12 +183,12 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="axis of a stored frame that counts sensor rows; 1 if frames are stored in portrait (default: 0)",
     )
-    group.add_argument("--roi", type=roi, metavar="R0:R1,C0:C1", help="use these rows and columns only")
+    group.add_argument("--roi", type=roi, metavar="R0:R1,C0:C1", help="use only these rows and columns")
     group.add_argument(
         "--overscan",
         type=overscan,
         metavar="auto|R0:R1,C0:C1",
-        help="take off rows or columns that see no light: auto, or which, with : for all (:,1024:1050)",
+        help="remove rows or columns that see no light: auto, or rows,columns with : for all (:,1024:1050)",
     )
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
     group.add_argument("--flats-exposure", type=list_of_seconds, metavar="S[,S...]", help="their exposure in seconds")
@@ -198,7 +196,7 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sample_arguments(commands: Any) -> None:
     text = "Draw raw frames from a noise model: dark frames, or noisy frames of a clean image."
-    sample = commands.add_parser("sample", help="make frames with the noise of a camera", description=text)
+    sample = commands.add_parser("sample", help="draw frames with the noise of a camera", description=text)
     sample.add_argument(
         "model", metavar="MODEL", help=f"model.json of a fit, or a built-in camera: {', '.join(CAMERAS)}"
     )
@@ -209,7 +207,7 @@ def _sample_arguments(commands: Any) -> None:
     sample.add_argument(
         "--exposure", type=list_of_seconds, metavar="S[,S...]", help="exposures in seconds (default: the model's)"
     )
-    sample.add_argument("--shape", type=shape_of, metavar="ROWSxCOLUMNS", help="of dark frames (default 480x640)")
+    sample.add_argument("--shape", type=shape_of, metavar="ROWSxCOLUMNS", help="size of dark frames (default 480x640)")
     sample.add_argument(
         "--clean",
         metavar="IMAGE",
@@ -223,45 +221,45 @@ def _sample_arguments(commands: Any) -> None:
 
 def _enhance_arguments(commands: Any) -> None:
     text = (
-        "Enhance a noisy video with the network that comes with hsnoise, or one that `hsnoise train` trained: of "
-        "display values (a video file or a folder of images), or with --camera of raw frames. Their noise should be as "
-        "strong as that which the network was trained on: an ordinary video has far less, and comes out worse. The "
-        "first eight frames or so come out poorer than those after them."
+        "Enhance a noisy video with the network that comes with hsnoise, or with one from `hsnoise train`. The video "
+        "holds display values (a video file or a folder of images) or, with --camera, raw frames. Its noise should be "
+        "as strong as in training: an ordinary video has far less, and comes out worse. The first eight frames or so "
+        "come out poorer than later ones."
     )
-    enhance = commands.add_parser("enhance", help="take the noise out of a video", description=text)
+    enhance = commands.add_parser("enhance", help="remove the noise from a video", description=text)
     enhance.add_argument("video", metavar="IN", help="a video file, a folder of images, or raw frames with --camera")
     enhance.add_argument("out", type=Path, metavar="OUT", help="video file to write: .mp4, .mkv, ...")
     enhance.add_argument(
         "--weights",
         type=Path,
         metavar="FILE",
-        help="weights.eqx of a training run (default: those of hsnoise, for a Canon 5D Mark III at ISO 25600)",
+        help="weights.eqx of a training run (default: the shipped ones, for a Canon 5D Mark III at ISO 25600)",
     )
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
     enhance.add_argument(
         "--exposure",
         type=list_of_seconds,
         metavar="S",
-        help="of raw frames, in seconds (default: what their files say)",
+        help="exposure of raw frames in seconds (default: as their files state)",
     )
     enhance.add_argument(
         "--cfa",
         type=cfa,
         metavar="CFA",
-        help="Bayer order of raw frames (default: what their files say, or else the model's)",
+        help="Bayer order of raw frames (default: as their files state, or else the model's)",
     )
     enhance.add_argument(
         "--brighten",
         type=float,
         default=1.0,
         metavar="X",
-        help="times more light (default 1), before the network sees the frames; with --camera the mean of the first "
+        help="multiply the light before the network sees it (default 1); with --camera the mean of the first "
         "frame becomes X times 0.2 of white",
     )
     enhance.add_argument(
         "--tile",
         type=positive,
         metavar="PIXELS",
-        help="work in tiles of so many (a multiple of the network's stride), in less memory: 256, say",
+        help="work in tiles of this size (a multiple of the network's stride) to save memory: 256, say",
     )
-    enhance.add_argument("--rate", type=float, default=25, help="frames a second of what says none (default 25)")
+    enhance.add_argument("--rate", type=float, default=25, help="frames per second if IN states none (default 25)")

@@ -1,86 +1,82 @@
-"""Progress: what is being done, since when, how much of it is left. In the terminal one line that is kept up to date;
-elsewhere a line at each new stage, and one every half minute.
+"""Progress: the stage, elapsed time, and time left. In a terminal one line that is kept up to date; elsewhere a line
+for each new stage, and one every half minute.
 """
 
 from __future__ import annotations
 
-import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, SpinnerColumn, Task
 from rich.text import Text
 
+from hsnoise._core.events import Event, counter
 from hsnoise.fit import fit
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 
-EVERY_S = 30.0  # where there is no terminal
-SPINNER = 2  # columns, with the space behind it
-LEAST_S = 5.0  # of a stage, before its rate says when it ends
-_COUNTED = re.compile(r"(.*): (\d+)(?: of (\d+))?")
+EVERY_S = 30.0  # without a terminal
+SPINNER = 2  # columns, including the space after it
+LEAST_S = 5.0  # of a stage, before its rate predicts its end
 
 
 class Account:
-    """What is being done, for a line of progress.
-
-    Called with the sentences that `improve` and others tell: "Adding row_noise", or "Adding row_noise: 12" and "Adding
-    row_noise: 12 of 60" after the 12th draw. What follows a semicolon stays at the end of the line.
-    """
+    """The current stage, for a line of progress."""
 
     def __init__(
-        self, stage: str, minutes: float | None = None, of: str = "draw", clock: Callable[[], float] = time.monotonic
+        self, stage: Event, minutes: float | None = None, of: str = "draw", clock: Callable[[], float] = time.monotonic
     ):
-        """minutes: after which the work is ended; of: what is counted."""
+        """minutes: time limit of the work; of: the unit that is counted."""
         self._of, self._clock, self._began = of, clock, clock()
         self._ends = None if minutes is None else self._began + 60 * minutes
-        self._stage, self._stage_began, self._done, self._total = stage, self._began, 0, 0
-        self._lock = threading.Lock()  # each thread that draws tells of it
+        self._now, self._stage_began = stage, self._began
+        self._lock = threading.Lock()  # every drawing thread reports progress
 
-    def tell(self, sentence: str) -> bool:
-        """Take note of a sentence; whether it is of a new stage."""
-        found = _COUNTED.fullmatch(sentence)
-        stage, done, total = (found[1], int(found[2]), int(found[3] or 0)) if found else (sentence, 0, 0)
+    def tell(self, event: Event) -> bool:
+        """Record an event; returns whether it begins a new stage."""
         with self._lock:
-            is_new = stage != self._stage
+            is_new = (event.stage, event.beside) != (self._now.stage, self._now.beside)
             if is_new:
-                self._stage, self._stage_began, self._done = stage, self._clock(), 0
-            self._done, self._total = max(self._done, done), total  # threads may overtake each other
+                self._now, self._stage_began = event, self._clock()
+            else:  # threads may overtake each other
+                self._now = replace(event, done=max(self._now.done, event.done))
         return is_new
 
     def line(self, columns: int | None = None) -> str:
         """For example "[2:30] Adding row_noise, draw 34 of 60; error 26.3; about 1:10 left".
 
-        What stands in the middle is left out if the line would have more than so many columns.
+        The middle part is left out if the line would exceed `columns`.
         """
-        what, *beside = self._stage.split("; ")
-        if self._done:
-            what += f", {self._of} {self._done}" + (f" of {self._total}" if self._total else "")
-        first, left = f"[{_clock(self._clock() - self._began)}] {what}", self._left()
-        whole = "; ".join([first, *beside, *left])
-        return whole if columns is None or len(whole) <= columns else "; ".join([first, *left])
+        now = self._now
+        what = f"[{_clock(self._clock() - self._began)}] {now.stage}"
+        if now.done:
+            what += f", {self._of} {now.done}" + ("" if now.total is None else f" of {now.total}")
+        left = self._left()
+        whole = "; ".join([what, *filter(None, [now.beside]), *left])
+        return whole if columns is None or len(whole) <= columns else "; ".join([what, *left])
 
     def _left(self) -> list[str]:
-        """The time that is left, if it can be told, in words."""
+        """The time left in words, if it can be estimated."""
         now = self._clock()
-        # What is finished in any case goes on beyond the end, nobody knows how long.
+        # Work that is always finished may run past the limit, for an unknown time.
         until_end = [] if self._ends is None or self._ends <= now else [self._ends - now]
-        taken = now - self._stage_began
-        if self._total > self._done > 0 and taken >= LEAST_S:
-            return [f"about {_clock(min([taken / self._done * (self._total - self._done), *until_end]))} left"]
+        taken, done, total = now - self._stage_began, self._now.done, self._now.total or 0
+        if total > done > 0 and taken >= LEAST_S:
+            return [f"about {_clock(min([taken / done * (total - done), *until_end]))} left"]
         return [f"at most {_clock(one)} left" for one in until_end]
 
 
 @contextmanager
-def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator[Callable[[str], Any]]:
-    """Say what is being done; the value takes the sentences of what is done next (see `Account`)."""
-    account, console = Account(stage, minutes, of), Console(stderr=True)
+def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator[Callable[[Event], Any]]:
+    """Show the current stage; the value takes the events of later stages."""
+    account, console = Account(Event(stage), minutes, of), Console(stderr=True)
     if console.is_terminal:
         with Progress(
             SpinnerColumn(), _Line(account, console.width - SPINNER), console=console, transient=True
@@ -92,8 +88,8 @@ def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator
     def say() -> None:
         print(account.line(), file=sys.stderr, flush=True)
 
-    def tell(sentence: str) -> None:
-        if account.tell(sentence):
+    def tell(event: Event) -> None:
+        if account.tell(event):
             say()
 
     say()
@@ -104,22 +100,21 @@ def busy(stage: str, minutes: float | None = None, of: str = "draw") -> Iterator
 def fit_with_progress(
     stack: FrameStack, method: str, model: NoiseModel | None = None, pixels: str = "auto"
 ) -> FitResult:
-    """`hsnoise.fit`, telling of the frames that are read and of the time that the fit takes."""
+    """`hsnoise.fit` with progress: the frames read, and the time of the fit."""
     frames = sum(stack.n_frames)
-    done = 0
+    reading = Event("Reading frames")
 
-    with busy("Reading frames", of="frame") as say:
+    with busy(reading.stage, of="frame") as say:
 
-        def tick() -> None:
-            nonlocal done
-            done += 1
-            say(f"Reading frames: {done} of {frames}" if done < frames else "Fitting")
+        def read(event: Event) -> None:
+            say(event if event.done < frames else Event("Fitting"))
 
+        tick = counter(read, reading, frames)
         return fit(stack, model=model, method=method, pixels=pixels, progress=tick)
 
 
 class _Line(ProgressColumn):
-    """The line of an account."""
+    """The progress line of an account."""
 
     def __init__(self, account: Account, columns: int):
         super().__init__()
@@ -131,7 +126,7 @@ class _Line(ProgressColumn):
 
 @contextmanager
 def _repeated(say: Callable[[], None]) -> Iterator[None]:
-    """Call `say` every half minute, however long what is within takes."""
+    """Call `say` every half minute inside this context."""
     ended = threading.Event()
 
     def repeat() -> None:

@@ -1,4 +1,4 @@
-"""What a fit and a story leave in a folder: model.json, table.csv, story.txt and figures."""
+"""Output files of a fit or a story: model.json, table.csv, story.txt and figures."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from hsnoise import criticism, report
+from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise.cli.progress import busy
 from hsnoise.criticism import Story
+from hsnoise.criticism.improve import improved
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -33,7 +34,7 @@ def improve_with_progress(
     page: Path | None = None,
     **limits: Any,
 ) -> Story:
-    """The loop; each model that it keeps is written to `out`, and the story so far to `page`, if there is to be one."""
+    """The loop; writes each model that it keeps to `out`, and the story so far to `page` if given."""
 
     def kept(story: Story) -> None:
         keep(story, out, source)
@@ -41,7 +42,7 @@ def improve_with_progress(
             report.write_report(page, story, stack, files=source.get("files", ()), seed=seed)
 
     with busy("Fitting the first model", limits.get("max_minutes")) as say:
-        return criticism.improve(stack, model=start, seed=seed, progress=say, keep=kept, **limits)
+        return improved(stack, say, model=start, seed=seed, keep=kept, **limits)
 
 
 def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
@@ -53,7 +54,7 @@ def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
 
 
 def write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bool = True) -> list[str]:
-    """model.json, table.csv and, unless told otherwise, the figures; returns their names."""
+    """Write model.json, table.csv and, by default, the figures; returns their names."""
     from hsnoise import plots  # matplotlib is slow to import
 
     provenance = {

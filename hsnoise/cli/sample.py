@@ -1,4 +1,4 @@
-"""The command `hsnoise sample`: frames with the noise of a camera."""
+"""The command `hsnoise sample`: draw frames with the noise of a camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hsnoise.cli.loading import model_of
 from hsnoise.model import NoiseModel, sample
 
 SAMPLE_SHAPE = (480, 640)
-# What files of other formats than .npz hold of the metadata, and what `hsnoise.load` takes where nothing is said.
+# Metadata that formats other than .npz hold, and the defaults of `hsnoise.load` for missing ones.
 HELD = {".npy": (), ".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
 BARE = {  # Python that reads the counts alone
     ".npz": "import numpy as np; counts = np.load({})['counts']",
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.out.parent.is_dir():
         raise ValueError(f"--out: there is no folder {args.out.parent}")
     if args.mean_e is not None and args.clean is None:
-        raise ValueError("--mean-e: goes with --clean, the image that it scales")
+        raise ValueError("--mean-e: goes with --clean, whose image it scales")
     if args.mean_e is not None and not args.mean_e > 0:
         raise ValueError(f"--mean-e: expected photoelectrons above 0, got {args.mean_e:g}")
     if args.shape is not None and args.clean is not None:
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]:
-    """What was written, in lines, the last one of Python that reads it."""
+    """Description of the written file in several lines; the last is Python that reads it."""
     n, frames, rows, columns = counts.shape
     what = f"{metadata['kind']} frame{'s' if n * frames > 1 else ''}"
     exposed = " and ".join(f"{t:g} s" for t in metadata["exposure_s"])
@@ -63,14 +63,14 @@ def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]
         f" {' x '.join(map(str, counts.shape))}",
     ]
     if metadata["kind"] == "flat":
-        lines.append('kind "flat": a picture of light, with the dark current added; no dark frames')
+        lines.append('kind "flat": a picture of light, with dark current added; not dark frames')
     held = HELD.get(path.suffix.lower(), tuple(metadata))
     lines.append(f"Beside the counts the file holds {', '.join(held)}" if held else "The file holds counts only")
     return [*lines, f"In Python: {_reading(path, n * frames, metadata, held)}"]
 
 
 def _reading(path: Path, n_frames: int, metadata: dict[str, Any], held: tuple[str, ...]) -> str:
-    """A line of Python that reads a file: counts alone where `hsnoise.load` would want more than the file holds."""
+    """Python that reads a file: counts alone if `hsnoise.load` would need more than the file holds."""
     suffix, name = path.suffix.lower(), repr(str(path))
     if n_frames == 1 or suffix == ".npy":
         return BARE[suffix].format(name)
@@ -83,7 +83,7 @@ def _value(value: Any) -> str:
 
 
 def draw(model: NoiseModel, exposures_s: Any, n_frames: int, clean: np.ndarray, seed: int) -> np.ndarray:
-    """Counts `[exposure, frame, row, column]`, frame by frame unless what happens in one depends on those before."""
+    """Counts `[exposure, frame, row, column]`, drawn frame by frame unless frames depend on earlier ones."""
     key = jax.random.key(seed)
     at_once = n_frames if any(effect.in_series for effect in model) else 1
     tasks = [(e, f) for e in range(len(exposures_s)) for f in range(0, n_frames, at_once)]
@@ -107,7 +107,7 @@ def metadata_of(model: NoiseModel, exposures_s: Any, kind: str) -> dict[str, Any
 
 
 def _clean(path: str, mean_e: float | None, model: NoiseModel) -> np.ndarray:
-    """Expected photoelectrons `[row, column]`: of an image in R, G, B each pixel keeps its own colour."""
+    """Expected photoelectrons `[row, column]`; each pixel keeps only its own colour of an R, G, B image."""
     image = read_image(path).astype(np.float32)
     if image.ndim == 3:
         if model.cfa == "mono":

@@ -1,4 +1,4 @@
-"""The table of parameters that the command line prints."""
+"""The parameter table of the command line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hsnoise.model import NoiseModel
 
 
 def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
-    """The parameters of a fit, and those that the frames were drawn with, if they are known."""
+    """The parameters of a fit beside the true ones, if known."""
     table = Table(box=SIMPLE_HEAD)
     table.add_column("parameter", no_wrap=True)
     for name in ("value", "standard error"):

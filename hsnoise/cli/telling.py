@@ -1,8 +1,7 @@
-"""Results in the terminal: the light and a sentence, what is doubtful, a table, and what else fits on the screen."""
+"""Results in the terminal: the light with a sentence, doubts, a table, and whatever else fits on the screen."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,60 +13,45 @@ from rich.text import Text
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise.cli.table import table_of
 from hsnoise.criticism import Comparison, Diagnosis, Story
-from hsnoise.criticism.finding import LEGEND
 from hsnoise.criticism.inspection.inspect import Inspection
+from hsnoise.criticism.sentences import LEGEND
 from hsnoise.fitting.result import TITLES, FitResult
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.structure import explained
 
-LINES, COLUMNS = 40, 100  # of a screen, where there is none; lines also at most
-OPTIONS = {
-    "exposure_s": "--exposure",
-    "black_level": "--black-level",
-    "white_level": "--white-level",
-    "cfa": "--cfa",
-    "roi": "--roi",
-    "overscan": "--overscan",
-    "shutter": "--shutter",
-    "kind": "--kind",
-    "flats": "--flats",
-    "report": "--report",
-    "model": "--model",
-    "params": "--model",
-    "seed": "--seed",
-}
+LINES, COLUMNS = 40, 100  # assumed without a terminal; LINES is also the maximum
 WORDS = ("added", "effect", "group of statistics", "worst group")  # headings of columns of text
 COLOURS = {Light.GREEN: "green", Light.AMBER: "yellow", Light.RED: "red"}
 
 
 @dataclass(frozen=True)
 class Page:
-    """What is told of a result, in this order.
+    """The printed parts of a result, in this order.
 
     Attributes:
         conclusion: the light and the sentence.
-        doubts: above the table.
+        doubts: sentences above the table.
         tables: tables, or lines of text.
-        notes: what should be known; as many as fit.
-        rest: what is told with --verbose only.
+        notes: further sentences, as many as fit.
+        rest: printed only with --verbose.
         colour: of the doubts.
     """
 
     conclusion: Conclusion
     doubts: tuple[str, ...] = ()
-    tables: tuple[Table | str, ...] = ()
+    tables: tuple[Table | tuple[str, ...], ...] = ()
     notes: tuple[str, ...] = ()
     rest: tuple[str, ...] = ()
     colour: str = "yellow"
 
 
 def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
-    """Print a page: what fits on one screen, how many lines were left out, and the `foot` in full; or all."""
+    """Print a page: what fits on one screen, the number of lines left out, and the whole `foot`; or everything."""
     console = screen()
-    doubts = [Text(f"! {in_options(one)}", page.colour) for one in page.doubts]
+    doubts = [Text(f"! {one}", page.colour) for one in page.doubts]
     head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
     tables = [one for table in page.tables for one in _rows(table, console)]
-    notes, rest = ([_printed(Text(in_options(one)), console) for one in part] for part in (page.notes, page.rest))
+    notes, rest = ([_printed(Text(one), console) for one in part] for part in (page.notes, page.rest))
     last = [_printed(Text(one), console) for one in foot]
     everything = [*head, *tables, *notes, *rest]
     room = LINES - _count(last) - 1
@@ -79,25 +63,17 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), flush=True)
 
 
-def in_options(text: str) -> str:
-    """A message of the library for users of the command line, who know its options, not arguments."""
-    argument, colon, rest = text.partition(":")
-    text = f"{OPTIONS[argument]}{colon}{rest}" if argument in OPTIONS else text
-    with_value = re.compile(r"\b(\w+)=(?=(['\"\d])|\W|$)")
-    return with_value.sub(lambda m: f"{OPTIONS[m[1]]}{' ' if m[2] else ''}" if m[1] in OPTIONS else m[0], text)
-
-
 def screen() -> Console:
-    """The terminal; else a file in which sentences are not broken."""
+    """The terminal, or a file in which sentences are not wrapped."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=COLUMNS, height=LINES + 1)
 
 
 def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | None = None) -> Page:
-    """rest: what else --verbose tells."""
+    """rest: what else --verbose prints."""
     return Page(
         conclusion=fit.conclusion,
-        doubts=_unsaid(fit.doubts, fit.conclusion),
+        doubts=fit.further_doubts,
         tables=(table_of(fit, truth),),
         notes=(f"{TITLES[fit.method]}: {fit.outcome}", *(f"- {note}" for note in fit.notes)),
         rest=rest,
@@ -126,11 +102,11 @@ def page_of_diagnosis(found: Diagnosis) -> Page:
 
 
 def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
-    """The steps, and the last fit."""
+    """A page of the steps and the last fit."""
     fit = page_of_fit(story.fit, truth=truth)
     return Page(
         conclusion=story.conclusion,
-        doubts=_unsaid(story.fit.doubts, story.conclusion),
+        doubts=story.fit.further_doubts,
         tables=(_plain(story.as_table()), *fit.tables),
         notes=tuple(one for one in (story.care, *fit.notes) if one),
         rest=tuple(one for one in (*story.details, story.ended, story.split) if one),
@@ -140,50 +116,45 @@ def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
 
 def page_of_inspection(found: Inspection) -> Page:
     parts = found.parts
-    notes = [line for name in ("determined", "next") for line in parts[name].splitlines()]
     return Page(
         conclusion=found.conclusion,
         doubts=found.findings,
-        tables=(f"\n{parts['capture']}\n", f"{parts['groups']}\n"),
-        notes=(*notes, *parts["assumed"].splitlines()),
-        rest=tuple(parts["budget"].splitlines()),
+        tables=(("", *parts["capture"], ""), (*parts["groups"], "")),
+        notes=(*parts["determined"], *parts["next"], *parts["assumed"]),
+        rest=parts["budget"],
     )
 
 
-def _unsaid(doubts: tuple[str, ...], conclusion: Conclusion) -> tuple[str, ...]:
-    return tuple(doubt for doubt in doubts if doubt not in conclusion.sentence)
-
-
 def _light(conclusion: Conclusion, console: Console) -> Text:
-    """A coloured disc and the sentence; where there is no colour the light is a word."""
+    """A coloured disc and the sentence; without colour the light is a word."""
     if console.color_system is None or console.no_color or console.options.ascii_only:
         return Text(str(conclusion))
     return Text.assemble(("● ", f"bold {COLOURS[conclusion.light]}"), (conclusion.sentence, "bold"))
 
 
 def _plain(table: Table) -> Table:
-    """A result's table without its grid, numbers to the right."""
+    """A result's table without grid, numbers aligned right."""
     table.box = SIMPLE_HEAD
     for column in table.columns:
         column.justify = "left" if column.header in WORDS else "right"
     return table
 
 
-Printed = tuple[str, int]  # what is printed, and how many lines of the screen that takes
+Printed = tuple[str, int]  # printed text and its number of screen lines
 
 
 def _printed(text: Text, console: Console) -> Printed:
-    """A sentence. Where there is no terminal it stays one line, for those who search."""
+    """A sentence; outside a terminal it stays one line, for searching."""
     lines = _lines(text, console)
     if console.is_terminal:
         return "\n".join(lines), len(lines)
     return text.plain, len(lines)
 
 
-def _rows(table: Table | str, console: Console) -> list[Printed]:
+def _rows(table: Table | tuple[str, ...], console: Console) -> list[Printed]:
     if isinstance(table, Table):
         return [(line, 1) for line in _lines(table, console)]
-    return [(line, -(-len(line) // console.width) or 1) for line in table.split("\n")]
+    return [(line, -(-len(line) // console.width) or 1) for line in table]
 
 
 def _lines(one: Table | Text, console: Console) -> list[str]:
@@ -197,9 +168,9 @@ def _count(some: Iterable[Printed]) -> int:
 
 
 def _fitting(head: list[Printed], tables: list[Printed], notes: list[Printed], room: int, small: int) -> list[Printed]:
-    """Whole sentences and rows that fit: of the head, what half of the room holds; then the tables; then notes.
+    """Whole sentences and rows that fit: the head in at most half the room, then the tables, then notes.
 
-    small: room on a small screen. Notes wait there; a table is rather scrolled than cut.
+    small: room on a small screen, where notes are left out and tables scroll rather than being cut.
     """
     shown, used = head[:1], head[0][1]
     for part, most in ((head[1:], room // 2), (tables, room), (notes, small)):

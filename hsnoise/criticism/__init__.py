@@ -8,7 +8,19 @@ from __future__ import annotations
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import Diagnosis, diagnose
 from hsnoise.criticism.improve import improve
+from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import Step, Story
 
-__all__ = ["Candidate", "Comparison", "Diagnosis", "Step", "Story", "compare", "diagnose", "improve"]
+__all__ = [
+    "Candidate",
+    "Comparison",
+    "Diagnosis",
+    "Ended",
+    "Step",
+    "Story",
+    "Verdict",
+    "compare",
+    "diagnose",
+    "improve",
+]

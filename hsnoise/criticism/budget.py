@@ -14,7 +14,8 @@ from hsnoise.criticism.budget_table import as_html, printed
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_fits, draw_capture, middle_of
+from hsnoise.simulation.draws import check_fits, draw_capture
+from hsnoise.simulation.portion import middle_of
 from hsnoise.statistics.decomposition import COMPONENTS, Component, mean_of
 from hsnoise.statistics.pixels.classes import levels_of, slope_over
 from hsnoise.statistics.pixels.flags import FLAGS, counts_of, flags_of

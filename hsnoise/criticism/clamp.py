@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.criticism.fingerprint import Bench
-from hsnoise.criticism.gaussian import Gaussian
 from hsnoise.criticism.ranking import Candidate, Evidence
-from hsnoise.criticism.reference import measure, reference
 from hsnoise.effects import BlackClamp
 from hsnoise.fit import fit, without_likelihood
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
+from hsnoise.simulation.gaussian import Gaussian
+from hsnoise.simulation.simulator import Simulator
 
 CLAMP = BlackClamp.name
 DRAWS = 40
@@ -21,12 +21,14 @@ DRAWS = 40
 def clamp_by_likelihood(
     fitted: FitResult, bench: Bench, evidence: Evidence
 ) -> tuple[Candidate, Evidence, Gaussian] | None:
-    """The capture refitted with a clamp: candidate, evidence and law with it; None if no better, or not to be done.
+    """The capture refitted with a clamp: candidate, evidence and distribution with it.
+
+    None if it is no better, or cannot be done.
 
     It can be done for a maximum-likelihood fit of darks at several exposures, without other effects in the model.
     """
     model = bench.model
-    if not isinstance(fitted, FitResult) or fitted.method != "ml" or CLAMP in model:
+    if not isinstance(fitted, FitResult) or fitted.method != Method.ML or CLAMP in model:
         return None
     if without_likelihood(model) or np.ptp(fitted.summary.exposure_s) == 0:
         return None
@@ -38,8 +40,9 @@ def clamp_by_likelihood(
     score = clamped.log_likelihood - fitted.log_likelihood - parameters
     if not score > 0 or not np.any(np.asarray(clamped.params[CLAMP].rate)):
         return None
-    own = reference(clamped.params, bench.part, DRAWS, bench.seed, bench.tick)
-    z = own.z(measure(bench.part, clamped.params).values)
-    misfit = max(own.law.normal_scores(z, own.groups).values())
+    simulator = Simulator(clamped.params, bench.simulator.portion, bench.simulator.key, bench.simulator.tick)
+    own = simulator.reference(clamped.params, DRAWS)
+    z = own.z(simulator.measured.values)
+    misfit = max(own.distribution.normal_scores(z, own.groups).values())
     candidate = Candidate(CLAMP, clamped.params[CLAMP], float(score), evidence.p_value(score), misfit)
-    return candidate, replace(evidence, z=z), own.law
+    return candidate, replace(evidence, z=z), own.distribution

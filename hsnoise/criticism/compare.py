@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,21 +16,18 @@ from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
 from hsnoise._core.threads import in_threads
-from hsnoise.criticism.reference import measure, misfits, reference
-from hsnoise.fitting.result import number
+from hsnoise.criticism import rules, sentences
 from hsnoise.frames.source import as_stack
-from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.joint import log_likelihood
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_effects, check_fits, darks_of, part_of
+from hsnoise.simulation.draws import check_effects, check_fits
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.reference import misfits
+from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import explained
 
 DRAWS = 40
 WORST = 5  # statistics told in words
-NOTABLE_Z = 4.0
-NOTABLE_GAIN = 1.0  # in z, of a statistic that came nearer
-CHANCE_P, FITS = 0.05, 3.0  # p-value and error of a model that fits: few draws give no small p-value
-CLOSE = 10.0  # error below which a model is of use, with doubts
 
 
 @dataclass(frozen=True)
@@ -58,21 +56,16 @@ class Comparison:
 
     @property
     def fits(self) -> bool:
-        """Whether the capture could have been drawn from the model."""
-        return self.p_value > CHANCE_P and self.error < FITS
+        """Whether the capture could have been drawn from the model: its error is one that right models have."""
+        return self.error < rules.FITS
 
     @property
     def conclusion(self) -> Conclusion:
         """Whether the model describes the capture, and in which group of statistics it fails most."""
-        error = f"error {number(self.error)}"
         if self.fits:
-            sentence = f"The model describes these frames: {error}, where 1.0 is as close as its own samples."
-            return Conclusion(Light.GREEN, sentence)
-        worst = max(self.groups, key=self.groups.__getitem__)
-        light = Light.AMBER if self.error < CLOSE else Light.RED
-        how = "comes close to these frames, but fails" if light == Light.AMBER else "does not describe these frames,"
-        sentence = f"The model {how} most of all in {worst}: {error}, 1.0 would be as close as its own samples."
-        return Conclusion(light, sentence)
+            return Conclusion(Light.GREEN, sentences.describes(self.error))
+        worst, is_close = max(self.groups, key=self.groups.__getitem__), self.error < rules.CLOSE
+        return Conclusion(Light.AMBER if is_close else Light.RED, sentences.fails(self.error, worst, is_close))
 
     @property
     def own_misfit(self) -> float:
@@ -82,10 +75,7 @@ class Comparison:
     @property
     def measure(self) -> str:
         """What the error is, in words."""
-        return (
-            f"error {self.error:.2f} (1.0: like the model's own samples): the worst misfit below,"
-            f" {max(self.groups.values()):.2f}, over that of the model's own samples, {self.own_misfit:.2f}"
-        )
+        return sentences.measure(self.error, max(self.groups.values()), self.own_misfit)
 
     def plot(self):
         """A figure of where the model fails: `hsnoise.plots.comparison`."""
@@ -146,13 +136,20 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
     check_fits(params, stack)
-    part = part_of(stack)
-    check_effects(params, part)
-    measured = measure(part, params)
+    portion = Portion.of(stack)
+    check_effects(params, portion.frames)
+    return compared(params, portion, draws=draws, seed=seed, tick=tick)
+
+
+def compared(
+    params: NoiseModel, portion: Portion, *, draws: int = DRAWS, seed: int, tick: Callable[[], None] = lambda: None
+) -> Comparison:
+    """What `compare` finds on a portion that is checked."""
+    simulator = Simulator(params, portion, key_for(seed, Purpose.COMPARE), tick)
     own, per_pixel = in_threads(  # the likelihood is compiled while captures are drawn
-        lambda work: work(),
-        [lambda: reference(params, part, draws, seed, tick), lambda: _per_pixel(params, part)],
+        lambda work: work(), [lambda: simulator.reference(params, draws), lambda: _per_pixel(params, portion.darks)]
     )
+    measured = simulator.measured
     z = own.z(measured.values)
     groups = misfits(z, own.groups)
     worst = max(groups.values())
@@ -165,29 +162,17 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
         worst=_in_words(own.names, measured.values, own.mean, z),
         p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
         log_likelihood_per_pixel=per_pixel,
-        skipped=(*measured.skipped, *_left_out(stack, part)),
+        skipped=(*measured.skipped, *portion.left_out),
     )
-
-
-def _left_out(stack: FrameStack, part: FrameStack) -> tuple[str, ...]:
-    """What of a large capture was not looked at."""
-    if part.window is None or part.shape == stack.shape:
-        return ()
-    first = part.window[1] - (0 if stack.window is None else stack.window[1])
-    return (f"only columns {first} to {first + part.shape[1] - 1} of {stack.shape[1]} were compared: large capture",)
 
 
 def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
     order = np.argsort(-np.abs(z))[:WORST]
     return tuple(
-        f"{names[i]}: measured {measured[i]:.3g}, the model gives {model[i]:.3g} ({_deviations(z[i])})"
+        sentences.off(names[i], float(measured[i]), float(model[i]), float(z[i]))
         for i in order
-        if abs(z[i]) > NOTABLE_Z
+        if abs(z[i]) > rules.NOTABLE_Z
     )
-
-
-def _deviations(z: float) -> str:
-    return f"{abs(z):.0f} standard deviations {'above' if z > 0 else 'below'}"
 
 
 def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
@@ -196,16 +181,16 @@ def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
     gains = [(abs(row[4]) - abs(now[row[0]][1]), row) for row in before.table if row[0] in now]
     gains.sort(key=lambda gain: -gain[0])
     return tuple(
-        f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with it {now[name][0]:.3g}"
+        sentences.brought_nearer(name, measured, model, z, now[name][0])
         for gain, (name, _, measured, model, z) in gains[:WORST]
-        if gain > NOTABLE_GAIN
+        if gain > rules.NOTABLE_GAIN
     )
 
 
-def _per_pixel(params: NoiseModel, part: FrameStack) -> float:
-    darks = darks_of(part)
+def _per_pixel(params: NoiseModel, darks: Portion) -> float:
+    frames = darks.frames
     try:
-        value = float(log_likelihood(params, darks))
+        value = float(log_likelihood(params, frames))
     except ValueError:  # an effect that states no likelihood
         return float("nan")
-    return value / (sum(darks.n_frames) * darks.shape[0] * darks.shape[1])
+    return value / (sum(frames.n_frames) * frames.shape[0] * frames.shape[1])

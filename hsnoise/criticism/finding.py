@@ -1,4 +1,4 @@
-"""What `diagnose` found, and how it is told."""
+"""What `diagnose` found."""
 
 from __future__ import annotations
 
@@ -6,27 +6,19 @@ import io
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
-from hsnoise._core.types import unit_in_words
+from hsnoise.criticism import rules
+from hsnoise.criticism import sentences as _sentences
+from hsnoise.criticism.outcomes import Verdict
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.effects import EFFECTS
 
-MISFIT_LEFT = 3.5  # normal score of the worst group up to which nothing stands out
 WORST = 5
-LEGEND = (
-    "score: log-likelihood ratio of this effect alone against nothing missing (what resembles the missing one scores,"
-    " too: the first is meant); z left: how far off the worst group of statistics is with it in the model, in"
-    " deviations of a normal law (below 3.5 is chance); p: chance of such a score if nothing is missing"
-)
-NEXT, NEXT_OWN = "hsnoise improve, or in Python ", "hsnoise.improve(stack, candidates=[...]), or "
-NEAREST = "most statistics would be explained, though none of them whole, by (improve tries these)"
-SIDES = "whether {} arises before or behind the gain is a first guess: improve fits both and keeps the likelier"
 
 
 @dataclass(frozen=True)
@@ -43,7 +35,7 @@ class Unexplained:
     @property
     def stands_out(self) -> bool:
         """Whether a group as a whole is off by more than chance; single statistics among hundreds may be."""
-        return self.misfit > MISFIT_LEFT
+        return self.misfit > rules.MISFIT_LEFT
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ class Diagnosis:
     """
 
     ranking: tuple[Candidate, ...]
-    verdict: str
+    verdict: Verdict
     best: Candidate | None
     names: tuple[str, ...]
     advice: str
@@ -72,18 +64,13 @@ class Diagnosis:
     @property
     def headline(self) -> str:
         """The verdict in a few words: "missing: row_noise and hot_pixels"."""
-        if not self.names:
-            return self.verdict
-        return f"missing: {(' or ' if self.verdict == 'ambiguous' else ' and ').join(self.names)}"
+        return _sentences.headline(self.verdict, self.names)
 
     @property
     def conclusion(self) -> Conclusion:
         """Whether the model lacks something, and what."""
-        if self.verdict == "nothing missing":
-            return Conclusion(Light.GREEN, "Nothing significant is missing.")
-        if self.verdict == "unexplained":
-            return Conclusion(Light.RED, "Something is left that no effect of the library explains.")
-        return Conclusion(Light.AMBER, f"{self.headline[0].upper()}{self.headline[1:]}.")
+        lights = {Verdict.NOTHING_MISSING: Light.GREEN, Verdict.UNEXPLAINED: Light.RED}
+        return Conclusion(lights.get(self.verdict, Light.AMBER), _sentences.judgement(self.verdict, self.names))
 
     @property
     def named(self) -> tuple[Candidate, ...]:
@@ -93,10 +80,14 @@ class Diagnosis:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is named, with a first estimate of its parameters, and what to do next."""
-        sides = [SIDES.format(c.name) for c in self.named if hasattr(c.effect, "after_gain")]
-        others = f"{NEAREST}: {', '.join(c.name for c in self.nearest[:WORST])}" if self.nearest else ""
-        told = (*map(_described, self.named), self.advice, others, *sides, self._next())
-        return tuple(sentence for sentence in told if sentence)
+        said = (
+            *(_sentences.first_estimate(c.effect) for c in self.named),
+            self.advice,
+            _sentences.come_nearest(c.name for c in self.nearest[:WORST]) if self.nearest else "",
+            *(_sentences.open_side(c.effect) for c in self.named),
+            "" if self.best is None else _sentences.next_call(type(self.best.effect) not in EFFECTS),
+        )
+        return tuple(sentence for sentence in said if sentence)
 
     def plot(self):
         """A figure of the ranking: `hsnoise.plots.ranking`."""
@@ -123,7 +114,7 @@ class Diagnosis:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(self.as_table())
-        for sentence in (LEGEND, *self.sentences, self.remains):
+        for sentence in (_sentences.LEGEND, *self.sentences, self.remains):
             if sentence:
                 console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
@@ -136,7 +127,7 @@ class Diagnosis:
             _html.conclusion(self.conclusion),
             _html.printed(self.as_table()),
             _html.sentences(self.sentences),
-            _html.details("What the columns mean, and what is left", _html.sentences((LEGEND, *remains))),
+            _html.details("What the columns mean, and what is left", _html.sentences((_sentences.LEGEND, *remains))),
         )
 
     @property
@@ -144,25 +135,5 @@ class Diagnosis:
         """What is still off with what is named in the model, in a sentence; empty if nothing stands out."""
         if not self.names or not self.unexplained.stands_out:
             return ""
-        left, statistics = self.unexplained, "; ".join(self.unexplained.statistics)
-        return (
-            f"still off with {' and '.join(self.names)} at the first estimate (the worst group, {left.group}, by"
-            f" {left.misfit:.1f} deviations; a refit may leave less): {statistics}"
-        )
-
-    def _next(self) -> str:
-        if self.best is None:
-            return ""
-        of_users = type(self.best.effect) not in EFFECTS
-        return f"next: {NEXT_OWN if of_users else NEXT}hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
-
-
-def _described(candidate: Candidate) -> str:
-    """What an effect is, and the first estimate of its parameters."""
-    effect = candidate.effect
-    values = []
-    for field, spec in effect.specs().items():
-        value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
-        values.append(f"{field} {value} {unit_in_words(spec.unit)}".rstrip())
-    values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
-    return f"{effect.name}: {effect.about()} First estimate (a fit tells it with its error): {', '.join(values)}."
+        left = self.unexplained
+        return _sentences.still_off(self.names, left.group, left.misfit, left.statistics)

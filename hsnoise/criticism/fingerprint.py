@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from hsnoise._core.threads import in_threads
-from hsnoise.criticism.candidates import Maker, made
-from hsnoise.criticism.gaussian import Gaussian
-from hsnoise.criticism.reference import Reference, measure
-from hsnoise.frames.stack import FrameStack
+from hsnoise.criticism.candidates import made
+from hsnoise.effects import Maker
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.gaussian import Gaussian
+from hsnoise.simulation.reference import Reference
+from hsnoise.simulation.simulator import Simulator
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
-SLOPE_DRAWS = 3
+SLOPE_DRAWS = 2
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off
 BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
-
-Task = tuple[Maker, float, int]  # candidate, amplitude, detail
 
 
 @dataclass(frozen=True)
@@ -32,9 +29,9 @@ class Fingerprint:
     amplitudes: tuple[float, ...]
     shifts: np.ndarray
 
-    def law(self, amplitude: float, null: Gaussian) -> Gaussian:
-        """Law of the statistics with the effect at `amplitude` in the sensor."""
-        return law_of(self.at(amplitude), null)
+    def distribution(self, amplitude: float, null: Gaussian) -> Gaussian:
+        """Distribution of the statistics with the effect at `amplitude` in the sensor."""
+        return distribution_of(self.at(amplitude), null)
 
     def at(self, amplitude: float) -> np.ndarray:
         """Shifts [detail, statistic], interpolated between the amplitudes that were drawn, linear from 0."""
@@ -45,68 +42,74 @@ class Fingerprint:
         return values[i - 1] + share * (values[i] - values[i - 1])
 
 
-def law_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True) -> Gaussian:
-    """Law of the statistics with something in the sensor that shifts them by one of `shifts` [detail, statistic].
+def distribution_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True) -> Gaussian:
+    """Distribution of the statistics where an effect shifts them by one of `shifts` [detail, statistic].
 
     of_details: their scatter is part of it.
     """
     mean = shifts.mean(0)
-    covariance = null.covariance + np.diag((RELATIVE_ERROR * mean) ** 2)
+    covariance = null.covariance.copy()
+    covariance[np.diag_indices_from(covariance)] += (RELATIVE_ERROR * mean) ** 2
     if of_details:
-        spread = shifts - mean
-        covariance = covariance + spread.T @ spread / max(len(shifts) - 1, 1)
+        spread = (shifts - mean) / np.sqrt(max(len(shifts) - 1, 1))
+        covariance += spread.T @ spread
     return Gaussian(mean, covariance)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What every candidate is drawn on: the model, a capture to be like, the draws of the model, where seeds start.
+    """What every candidate is drawn on: the simulator of the model, and draws of the model itself."""
 
-    `drawn` holds shifts [statistic] by candidate, amplitude and detail.
-    """
-
-    model: NoiseModel
-    part: FrameStack
+    simulator: Simulator
     base: Reference
-    seed: int
-    tick: Callable[[], None]
-    drawn: dict[Task, np.ndarray] = field(default_factory=dict)
+
+    @staticmethod
+    def of(simulator: Simulator, draws: int) -> Bench:
+        return Bench(simulator, simulator.reference(simulator.model, draws))
+
+    @property
+    def model(self) -> NoiseModel:
+        return self.simulator.model
+
+    @property
+    def z(self) -> np.ndarray:
+        """The capture [statistic] in units of the base draws' deviation."""
+        return self.base.z(self.simulator.measured.values)
 
     def fingerprints(self, wanted: Mapping[str, tuple[Maker, tuple[float, ...]]], details: int) -> list[Fingerprint]:
         """Draw candidates, by name a maker and amplitudes, on top of the model; each amplitude with several details.
 
-        The draws share their random numbers with those of the model. All are drawn in one go, so that one effect is
-        compiled while another is drawn, and none a second time.
+        All are drawn in one go, details outermost, so that one effect is compiled while another is drawn, and none a
+        second time.
         """
         tasks = [
-            (maker, amplitude, detail)
+            (name, amplitude, detail)
             for detail in range(details)
-            for maker, amplitudes in wanted.values()
+            for name, (_, amplitudes) in wanted.items()
             for amplitude in amplitudes
         ]
-        new = [task for task in tasks if task not in self.drawn]
-
-        def draw(task: Task) -> np.ndarray:
-            return self.shift(self.model.add(made(*task)), task[2])
-
-        self.drawn.update(zip(new, in_threads(draw, new, self.tick), strict=True))
-        prints = []
-        for name, (maker, amplitudes) in wanted.items():
-            shifts = [[self.drawn[maker, amplitude, detail] for detail in range(details)] for amplitude in amplitudes]
-            prints.append(Fingerprint(name, maker, amplitudes, np.array(shifts)))
-        return prints
+        if not tasks:
+            return []
+        models = [(self.model.add(made(wanted[name][0], *rest)), rest[1]) for name, *rest in tasks]
+        shifts = dict(zip(tasks, self.shifts(models), strict=True))
+        return [
+            Fingerprint(name, maker, of, np.array([[shifts[name, a, detail] for detail in range(details)] for a in of]))
+            for name, (maker, of) in wanted.items()
+        ]
 
     def slopes(self) -> np.ndarray:
         """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
         moved = _moved_models(self.model)
-        tasks = [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
-        shifts = in_threads(lambda task: self.shift(*task), tasks, self.tick)
-        return REACH * np.stack(shifts).reshape(len(moved), SLOPE_DRAWS, -1).mean(1)
+        steps = np.full(len(moved), 1 / REACH)
+        return self.simulator.slopes(self.model, moved, steps, SLOPE_DRAWS).mean(0) / self.base.deviation
 
-    def shift(self, changed: NoiseModel, number: int) -> np.ndarray:
-        """Statistics of draw `number` of a changed model less those of the model, of the same random numbers."""
-        values = measure(draw_capture(self.seed + number, changed, self.part), self.model).values
-        return (values - self.base.draws[number]) / self.base.deviation
+    def shifts(self, wanted: Sequence[tuple[NoiseModel, int]]) -> np.ndarray:
+        """Statistics of draws of changed models, by model and number, less those of the model [draw, statistic].
+
+        Of the same random numbers, and in units of the base draws' deviation.
+        """
+        numbers = [number for _, number in wanted]
+        return (self.simulator.drawn(wanted) - self.base.draws[numbers]) / self.base.deviation
 
 
 def _moved_models(model: NoiseModel) -> list[NoiseModel]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 
-from hsnoise.criticism.reference import measure, reference
+from hsnoise.criticism import sentences
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
-DRAWS, SEEDS = 40, 5000  # of the likelihood; where its seeds begin, beyond those of fits
+DRAWS = 40  # of the likelihood
 
 
 def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
@@ -25,24 +27,17 @@ def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, Fram
     return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
 
 
-def told_of(fitted: FrameStack, held_out: FrameStack | None) -> str:
+def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     """Which frames were fitted and which held out, in words."""
     if held_out is None:
         return ""
     kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
-    return (
-        f"Fitted and compared were the first {_span(kept)} dark frames of each exposure; held-out: the log-likelihood"
-        f" of the statistics of the other {_span(held_out.n_frames)}, in nats (one more: 2.7 times as probable). To fit"
-        " all of them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
-    )
+    return sentences.frames_apart(kept, held_out.n_frames)
 
 
-def log_likelihood(model: NoiseModel, frames: FrameStack, seed: int) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of frames, by draws that no fit has seen, nats."""
-    own = reference(model, frames, DRAWS, seed + SEEDS)
-    values = measure(frames, model).values
-    return float(own.law.log_density(own.z(values)) - np.log(own.deviation).sum())
-
-
-def _span(numbers: Sequence[int]) -> str:
-    return f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"
+def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callable[[], None] = lambda: None) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats."""
+    simulator = Simulator(model, portion, key_for(seed, Purpose.HELD_OUT), tick)
+    own = simulator.reference(model, DRAWS)
+    z = own.z(simulator.measured.values)
+    return float(own.distribution.log_density(z) - np.log(own.deviation).sum())

@@ -1,8 +1,8 @@
 """Which effects come nearest where none explains a capture: those that explain most of its statistics.
 
-Far off, the likelihood ratio of normal laws goes to whatever makes statistics scatter most. By Student's t instead,
-statistics that others will have to explain count alike however far off they are (Lange, Little, Taylor, "Robust
-statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
+Far off, the likelihood ratio of normal distributions goes to whatever makes statistics scatter most. By Student's t
+instead, statistics that others will have to explain count alike however far off they are (Lange, Little, Taylor,
+"Robust statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.ranking import GRID, Candidate, Evidence
-from hsnoise.criticism.reference import misfits
+from hsnoise.simulation.reference import misfits
 
 FREEDOM = 4.0
 ITERATIONS = 10
-LEAST_GAIN = 8.0  # nats
-LEAST_SHARE = 0.5  # of the misfit of the worst group, at least, that an effect takes away to be tried for it
 
 
 def nearest(
@@ -43,7 +42,7 @@ def nearest(
     found = []
     for of in prints:
         loss, amplitude, detail = _best(of, lambda shift: _loss(z - shift, slopes, variance))
-        if nothing - loss > LEAST_GAIN:
+        if nothing - loss > evidence.least:
             found.append((loss, replace(listed[of.name], effect=made(of.maker, amplitude, detail))))
     ordered = [candidate for _, candidate in sorted(found, key=lambda pair: pair[0])]
     of_worst = _of_worst_group(prints, listed, evidence)
@@ -65,7 +64,7 @@ def _of_worst_group(
 
     (left, amplitude, detail), of = min(((_best(of, misfit_with), of) for of in prints), key=lambda pair: pair[0])
     gain = misfit[worst] - left
-    if gain < LEAST_SHARE * misfit[worst] or gain * of_group.sum() / 2 < LEAST_GAIN:
+    if gain < rules.HALF * misfit[worst] or gain * of_group.sum() / 2 < evidence.least:
         return None
     return replace(listed[of.name], effect=made(of.maker, amplitude, detail))
 

@@ -8,18 +8,17 @@ from functools import cached_property
 
 import numpy as np
 
+from hsnoise._core.threads import in_threads
+from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
-from hsnoise.criticism.fingerprint import Fingerprint, law_of
-from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.fingerprint import Fingerprint, distribution_of
 from hsnoise.effects import AbstractEffect
+from hsnoise.simulation.gaussian import Gaussian
 
 GRID = np.geomspace(0.15, 5.0, 18)  # amplitudes that are tried
 CLOSE = np.geomspace(0.6, 1.6, 7)  # the same, relative, around the best
 PAIR_FIRST, PAIR_SECOND = np.array([0.7, 1.0, 1.3]), np.geomspace(0.2, 4.0, 6)
 LEAST_P = 1e-9
-EVIDENCE = 8.0  # least log-likelihood ratio from which an effect is there: Markov's inequality, of 27 candidates
-CHOSEN = {"periodic_banding": 5.0}  # nats: its frequency is that of the highest of some hundred lines of the capture
-FALSE_ALARMS, TAIL = 0.001, 0.1  # probability of one; share of the draws that tell how the scores of chance fall off
 LEADERS = 3  # candidates that are paired with all others
 
 
@@ -48,30 +47,37 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the candidates are judged by: z [statistic] of the capture, its law if nothing is missing, names, groups."""
+    """What candidates are judged by: z of the capture [statistic], its distribution if nothing is missing, groups."""
 
     z: np.ndarray
     null: Gaussian
     names: tuple[str, ...]
     groups: tuple[str, ...]
     candidates: int
-    limit: float = EVIDENCE  # log-likelihood ratio from which an effect is there
+    chance: float = 0.0  # score that draws of the model exceed in CHANCE_RATE of the cases; 0 if none were scored
+    has_flats: bool = False  # whether the capture has flats
 
     @property
-    def has_flats(self) -> bool:
-        return any(group.startswith("flats") for group in self.groups)
+    def least(self) -> float:
+        """Log-likelihood ratio, nats, from which one of the candidates may be there."""
+        return rules.evidence(self.candidates)
+
+    @property
+    def limit(self) -> float:
+        """Log-likelihood ratio, nats, from which one of them is there, what chance gives in such a capture included."""
+        return max(self.least, self.chance)
 
     @cached_property
     def nothing(self) -> float:
         """Log density of the capture if nothing is missing."""
         return float(self.null.log_density(self.z))
 
-    def score(self, law: Gaussian) -> float:
-        """Log-likelihood ratio of a law against "nothing missing"."""
-        return float(law.log_density(self.z)) - self.nothing
+    def score(self, distribution: Gaussian) -> float:
+        """Log-likelihood ratio of a distribution against "nothing missing"."""
+        return float(distribution.log_density(self.z)) - self.nothing
 
-    def misfit(self, law: Gaussian) -> float:
-        return max(law.normal_scores(self.z, self.groups).values())
+    def misfit(self, distribution: Gaussian) -> float:
+        return max(distribution.normal_scores(self.z, self.groups).values())
 
     def p_value(self, score: float) -> float:
         # A likelihood ratio exceeds c by chance at most once in exp(c) (Markov), in any of the candidates.
@@ -88,8 +94,9 @@ class Judged:
     misfit: float
 
     def candidate(self, evidence: Evidence) -> Candidate:
-        covariance = self.of.law(self.amplitude, evidence.null).covariance
-        closest = [Gaussian(shift, covariance).log_density(evidence.z) for shift in self.of.at(self.amplitude)]
+        covariance = self.of.distribution(self.amplitude, evidence.null).covariance
+        off = evidence.z - self.of.at(self.amplitude)
+        closest = Gaussian(np.zeros(off.shape[1]), covariance).log_density(off)
         effect = made(self.of.maker, self.amplitude, int(np.argmax(closest)))
         return Candidate(self.of.name, effect, self.score, evidence.p_value(self.score), self.misfit)
 
@@ -106,67 +113,81 @@ class Pair:
     shifts: tuple[np.ndarray, np.ndarray]
     score: float
     misfit: float
-    law: Gaussian
+    distribution: Gaussian
+
+
+def judge_all(prints: Iterable[Fingerprint], evidence: Evidence, amplitudes: np.ndarray = GRID) -> list[Judged]:
+    """Fingerprints at the best of some amplitudes each, best first."""
+    found = in_threads(lambda of: judge(of, evidence, amplitudes), prints)
+    return sorted(found, key=lambda one: -one.score)
 
 
 def judge(of: Fingerprint, evidence: Evidence, amplitudes: np.ndarray = GRID) -> Judged:
     """A fingerprint at the best of some amplitudes."""
-    laws = [of.law(float(amplitude), evidence.null) for amplitude in amplitudes]
-    scores = [evidence.score(law) for law in laws]
+    tried = [of.distribution(float(amplitude), evidence.null) for amplitude in amplitudes]
+    scores = [evidence.score(distribution) for distribution in tried]
     i = int(np.argmax(scores))
-    score = scores[i] - CHOSEN.get(of.name, 0.0)
-    return Judged(of, float(amplitudes[i]), score, evidence.misfit(laws[i]))
+    score = scores[i] - made(of.maker, 1.0, 0).selection_nats
+    return Judged(of, float(amplitudes[i]), score, evidence.misfit(tried[i]))
 
 
-def limit_by_chance(prints: Iterable[Fingerprint], null: Gaussian, z: np.ndarray) -> float:
+def limit_by_chance(prints: Iterable[Fingerprint], evidence: Evidence, z: np.ndarray) -> float:
     """Score that hardly any capture with nothing missing exceeds, from the z [draw, statistic] of such draws, nats.
 
-    Laws that are estimated from few draws give more by chance than Markov's inequality allows. The best scores of the
-    draws fall off exponentially.
+    With distributions estimated from few draws, scores exceed Markov's bound. The best scores of the draws fall off
+    exponentially.
     """
-    nothing = null.log_density(z)
-    laws = [of.law(float(amplitude), null) for of in prints for amplitude in GRID[::2]]
-    best = np.max([law.log_density(z) for law in laws], 0) - nothing
-    start = float(np.quantile(best, 1 - TAIL))
+
+    def best_of(of: Fingerprint) -> np.ndarray:
+        return np.max([of.distribution(float(amplitude), evidence.null).log_density(z) for amplitude in GRID[::2]], 0)
+
+    best = np.max(in_threads(best_of, prints), 0) - evidence.null.log_density(z)
+    start = float(np.quantile(best, 1 - rules.CHANCE_TAIL))
     beyond = float(np.mean(best[best > start] - start)) if (best > start).any() else 0.0
-    return max(EVIDENCE, start + beyond * float(np.log(TAIL / FALSE_ALARMS)))
+    return start + beyond * float(np.log(rules.CHANCE_TAIL / rules.CHANCE_RATE))
 
 
 def best_pairs(judged: list[Judged], evidence: Evidence, number: int) -> list[Pair]:
     """The pairs that describe the capture best, of the leading candidates with all others; `judged` is best first."""
-    found = []
-    for i, first in enumerate(judged[:LEADERS]):
-        alone = {float(a): first.of.law(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude}
-        for second in judged[i + 1 :]:
-            laws = _laws_together(alone, second, evidence.null)
-            scored = [(evidence.score(law), amplitudes, law) for amplitudes, law in laws]
-            found.append((*max(scored, key=lambda one: one[0]), (first, second)))
-    best = sorted(found, key=lambda one: -one[0])[:number]
-    return [_pair(score, amplitudes, law, both, evidence) for score, amplitudes, law, both in best]
+    alone = {
+        first.of.name: {float(a): first.of.distribution(float(a), evidence.null) for a in PAIR_FIRST * first.amplitude}
+        for first in judged[:LEADERS]
+    }
+
+    def best_of(both: tuple[Judged, Judged]):
+        together = _together(alone[both[0].of.name], both[1], evidence.null)
+        scored = [(evidence.score(distribution), amplitudes, distribution) for amplitudes, distribution in together]
+        score, amplitudes, distribution = max(scored, key=lambda one: one[0])
+        return score, amplitudes, distribution, both
+
+    pairs = [(first, second) for i, first in enumerate(judged[:LEADERS]) for second in judged[i + 1 :]]
+    best = sorted(in_threads(best_of, pairs), key=lambda one: -one[0])[:number]
+    return [_pair(score, amplitudes, distribution, both, evidence) for score, amplitudes, distribution, both in best]
 
 
-def _pair(score: float, amplitudes, law: Gaussian, both, evidence: Evidence) -> Pair:
+def _pair(score: float, amplitudes, distribution: Gaussian, both, evidence: Evidence) -> Pair:
     first, second = (replace(one, amplitude=a).candidate(evidence) for one, a in zip(both, amplitudes, strict=True))
     shifts = [one.of.at(a).mean(0) for one, a in zip(both, amplitudes, strict=True)]
     names, effects = (first.name, second.name), (first.effect, second.effect)
-    return Pair(names, effects, (shifts[0], shifts[1]), score, evidence.misfit(law), law)
+    return Pair(names, effects, (shifts[0], shifts[1]), score, evidence.misfit(distribution), distribution)
 
 
 def closest(of: Fingerprint, evidence: Evidence, beside: np.ndarray) -> AbstractEffect:
     """The effect with the amplitude and details that describe the capture best, with `beside` shifting it, too."""
-    scored = []
-    for amplitude in map(float, GRID):
+
+    def best_at(amplitude: float) -> tuple[float, float, int]:
         shifts = of.at(amplitude)
-        covariance = law_of(shifts, evidence.null, of_details=False).covariance
-        densities = [Gaussian(one + beside, covariance).log_density(evidence.z) for one in shifts]
-        scored += [(float(density), amplitude, detail) for detail, density in enumerate(densities)]
-    _, amplitude, detail = max(scored, key=lambda one: one[0])
+        covariance = distribution_of(shifts, evidence.null, of_details=False).covariance
+        densities = Gaussian(np.zeros(len(beside)), covariance).log_density(evidence.z - beside - shifts)
+        return float(densities.max()), amplitude, int(densities.argmax())
+
+    _, amplitude, detail = max(in_threads(best_at, map(float, GRID)), key=lambda one: one[0])
     return made(of.maker, amplitude, detail)
 
 
-def _laws_together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
-    """Amplitudes and laws with both effects in the sensor, `alone` those of the first: shifts and scatters add."""
+def _together(alone: dict[float, Gaussian], second: Judged, null: Gaussian):
+    """Amplitudes and distributions with both effects in the sensor, `alone` those of the first: all of it adds."""
     for b in PAIR_SECOND:
-        other = second.of.law(float(b), null)
+        other = second.of.distribution(float(b), null)
         for a, one in alone.items():
             yield (a, float(b)), Gaussian(one.mean + other.mean, one.covariance + other.covariance - null.covariance)

@@ -8,20 +8,18 @@ from functools import reduce
 
 import numpy as np
 
-from hsnoise._core.threads import in_threads
-from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, law_of
-from hsnoise.criticism.gaussian import Gaussian
+from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, distribution_of
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
-from hsnoise.fitting.knobs import Knob, knobs
+from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import share_of_far
+from hsnoise.simulation.gaussian import Gaussian, share_of_far
 
 ITERATIONS = 3
-DRAWS, SLOPE_DRAWS, PAIR_DRAWS = 6, 3, 12
+SHORT_STEP = 0.05  # of an unconstrained number: where a search ends
+DRAWS, SLOPE_DRAWS, PAIR_DRAWS, NEARBY_DRAWS = 6, 2, 12, 16
 STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
-MANY_DRAWS = 24
 NEARBY_ERROR = 0.02  # of shifts close to the capture
 TINY = 1e-3  # a parameter of the base that is zero
 
@@ -40,7 +38,14 @@ def refined(effects: Sequence[AbstractEffect], bench: Bench, evidence: Evidence)
         information = weighted @ slopes + np.eye(len(gone)) / PRIOR_SIGMA**2
         return np.linalg.solve(information, weighted @ (evidence.z - mean))
 
-    model = _stepped(model, knobs(model, names), step, bench)
+    turned = parameters_of(model, names)
+    start = y = turned.read(model)
+    for _ in range(ITERATIONS if turned.numbers else 0):  # an effect may hold all its numbers
+        taken = _limited(step(_shifts(model, turned, y, bench), _slopes(model, turned, y, bench), y - start))
+        y = y + taken
+        if np.abs(taken).max() < SHORT_STEP:
+            break
+    model = turned.put(model, y)
     return tuple(model[name] for name in names)
 
 
@@ -48,10 +53,9 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
     """A pair with parameters refined together from `start`, and drawn together: strong effects do not just add."""
     effects = refined(start, bench, evidence)
     model = reduce(NoiseModel.add, effects, bench.model)
-    shifts = np.stack(in_threads(lambda number: bench.shift(model, number), range(PAIR_DRAWS), bench.tick))
-    law = law_of(shifts, evidence.null)
-    score = evidence.score(law)
-    again = replace(pair, effects=(effects[0], effects[1]), score=score, misfit=evidence.misfit(law), law=law)
+    distribution = distribution_of(bench.shifts([(model, number) for number in range(PAIR_DRAWS)]), evidence.null)
+    score, misfit = evidence.score(distribution), evidence.misfit(distribution)
+    again = replace(pair, effects=(effects[0], effects[1]), score=score, misfit=misfit, distribution=distribution)
     return max(pair, again, key=lambda one: one.score)
 
 
@@ -59,66 +63,64 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
     """Log-likelihood ratio of an effect, and the effect, with its parameters and the base brought close to the capture.
 
     Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
-    no evidence that there is the effect at all: nothing of the base is held against it.
+    no evidence that there is the effect at all: nothing of the base is held against it. Slopes are those where the
+    search starts: what the base does to the statistics hardly depends on the effect.
     """
-    own = bench.base.law.covariance
+    own = bench.base.distribution.covariance
     model = bench.model.add(effect)
-    turned = knobs(model, (effect.name,)), _base_knobs(model)
-    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(some) for some in turned]) ** -2
+    of_effect, of_base = parameters_of(model, (effect.name,)).numbers, _base_numbers(model)
+    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(of_effect), len(of_base)]) ** -2
+    turned = of_numbers(model, (*of_effect, *of_base))
+    slopes = np.concatenate(
+        [
+            _slopes(model, of_numbers(model, of_effect), turned.read(model)[: len(of_effect)], bench),
+            _slopes(bench.model, of_numbers(bench.model, of_base), turned.read(model)[len(of_effect) :], bench),
+        ],
+        axis=1,
+    )
+    start = y = turned.read(model)
+    for _ in range(ITERATIONS):
+        nearby = _nearby(_shifts(model, turned, y, bench), own)
+        off = evidence.z - nearby.mean
+        share = share_of_far(off / np.sqrt(np.diagonal(nearby.covariance)))
+        weighted = slopes.T @ (share[:, None] * np.linalg.inv(nearby.covariance) * share)
+        taken = _limited(np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * (y - start)))
+        y = y + taken
+        if np.abs(taken).max() < SHORT_STEP:
+            break
+    there = turned.put(model, y)
+    numbers = range(min(NEARBY_DRAWS, len(bench.base.draws)))
+    shifts = bench.shifts([(there, number) for number in numbers])
+    return evidence.score(_nearby(shifts, own)), there[effect.name]
 
-    def step(shifts: np.ndarray, slopes: np.ndarray, gone: np.ndarray) -> np.ndarray:
-        law = _law_nearby(shifts, own)
-        off = evidence.z - law.mean
-        share = share_of_far(off / np.sqrt(np.diagonal(law.covariance)))
-        weighted = slopes.T @ (share[:, None] * np.linalg.inv(law.covariance) * share)
-        return np.linalg.solve(weighted @ slopes + np.diag(prior), weighted @ off - prior * gone)
 
-    there = _stepped(model, [*turned[0], *turned[1]], step, bench)
-    numbers = range(min(MANY_DRAWS, len(bench.base.draws)))
-    shifts = np.stack(in_threads(lambda number: bench.shift(there, number), numbers, bench.tick))
-    return evidence.score(_law_nearby(shifts, own)), there[effect.name]
+def _limited(step: np.ndarray) -> np.ndarray:
+    """A step, shortened where it is longer than statistics are straight lines of the parameters."""
+    return step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
 
 
-def _stepped(model: NoiseModel, turned: list[Knob], step_of: Step, bench: Bench) -> NoiseModel:
-    """The model after a few steps of its numbers, made from shifts, slopes and how far the numbers have gone."""
-    start = y = np.array([knob.read(model) for knob in turned])
-    for _ in range(ITERATIONS if turned else 0):  # an effect may hold all its numbers
-        step = step_of(*_shifts_and_slopes(model, turned, y, bench), y - start)
-        y = y + step * min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-12))
-    return _at(model, turned, y)
-
-
-def _law_nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
-    """Law of the statistics around draws with these shifts [draw, statistic]; own: covariance of a model's draws."""
+def _nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
+    """Distribution of the statistics around draws with these shifts [draw, statistic]; own: covariance of draws."""
     mean = shifts.mean(0)
     return Gaussian(mean, own * (1 + 1 / len(shifts)) + np.diag((NEARBY_ERROR * mean) ** 2))
 
 
-def _base_knobs(model: NoiseModel) -> list[Knob]:
-    """The base parameters that are not zero; black levels are told by the means of the counts alone."""
-    found = []
-    for name, field in BASE.items():
-        if name in model and name != "black_level":
-            values = np.asarray(getattr(model[name], field), float)
-            places = [place for place in np.ndindex(values.shape) if values[place] > TINY]
-            found += [Knob(name, name, field, place, 0.0, None) for place in places]
-    return found
+def _base_numbers(model: NoiseModel) -> list[Number]:
+    """The base parameters that are not zero; black levels follow from the means of the counts alone."""
+    names = [name for name in BASE if name in model and name != "black_level"]
+    return [n for n in numbers_of(model, names) if n.field == BASE[n.effect] and n.value_in(model) > TINY]
 
 
-def _shifts_and_slopes(
-    model: NoiseModel, turned: list[Knob], y: np.ndarray, bench: Bench
-) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts at y [draw, statistic] and their derivatives [statistic, knob], by common random numbers."""
-    moved = [_at(model, turned, y + STEP * (np.arange(len(y)) == i)) for i in range(len(y))]
-    tasks = [(_at(model, turned, y), number) for number in range(DRAWS)]
-    tasks += [(one, number) for one in moved for number in range(SLOPE_DRAWS)]
-    drawn = np.stack(in_threads(lambda task: bench.shift(*task), tasks, bench.tick))
-    shifts = drawn[:DRAWS]
-    apart = drawn[DRAWS:].reshape(len(y), SLOPE_DRAWS, -1) - shifts[None, :SLOPE_DRAWS]
-    return shifts, apart.mean(1).T / STEP
+def _shifts(model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench) -> np.ndarray:
+    """Shifts of the statistics at y [draw, statistic]."""
+    there = turned.put(model, y)
+    return bench.shifts([(there, number) for number in range(DRAWS)])
 
 
-def _at(model: NoiseModel, turned: list[Knob], y: np.ndarray) -> NoiseModel:
-    for knob, x in zip(turned, y, strict=True):
-        model = knob.put(model, x)
-    return model
+def _slopes(model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench) -> np.ndarray:
+    """Derivatives of the statistics at y [statistic, number], by common random numbers."""
+    if not turned.numbers:
+        return np.zeros((len(bench.base.mean), 0))
+    moved = [turned.put(model, y + STEP * (np.arange(len(y)) == i)) for i in range(len(y))]
+    slopes = bench.simulator.slopes(turned.put(model, y), moved, np.full(len(y), STEP), SLOPE_DRAWS)
+    return (slopes.mean(0) / bench.base.deviation).T

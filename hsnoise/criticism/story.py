@@ -1,4 +1,4 @@
-"""What `improve` returns: the steps that a model took, and how the story is told."""
+"""What `improve` returns: the steps that a model took."""
 
 from __future__ import annotations
 
@@ -14,16 +14,13 @@ from rich.table import Table
 from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
-from hsnoise._core.types import unit_in_words
-from hsnoise.criticism.compare import CLOSE, FITS, Comparison, nearer
+from hsnoise.criticism import rules, sentences
+from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
+from hsnoise.criticism.outcomes import Ended, Ending, Verdict
 from hsnoise.fit import without_likelihood
-from hsnoise.fitting.result import FitResult, number, rounded
+from hsnoise.fitting.result import FitResult, number
 from hsnoise.model import NoiseModel
-
-CHANCE_ERROR = 2.0  # of a right model, rarely exceeded
-SIDES_APART = 6.0  # nats from which frames tell on which side of the gain an effect is
-FINISHED = "Nothing significant is left"
 
 
 @dataclass(frozen=True)
@@ -51,8 +48,8 @@ class Step:
         """What was fitted of the effect that was added, and what was chosen for it, in words."""
         if self.added is None:
             return ()
-        open_ = f"{self.added} fits as well on the other side of the gain: these frames do not tell which it is on."
-        return (*_sizes(self.fit, self.added), *([open_] if self.ahead < SIDES_APART else []))
+        effect = self.fit.params[self.added]
+        return sentences.sizes(self.fit.rows_of(self.added), effect, self.ahead < rules.SIDES_APART)
 
 
 @dataclass(frozen=True)
@@ -61,12 +58,12 @@ class Story:
 
     Attributes:
         steps: from the first fit to the last that was kept.
-        ended: why it ended, in a sentence.
+        ending: how it ended; `ended` is that in a sentence.
         split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
     """
 
     steps: tuple[Step, ...]
-    ended: str
+    ending: Ending
     split: str = ""
 
     @property
@@ -81,30 +78,31 @@ class Story:
     @property
     def finished(self) -> bool:
         """Whether nothing significant was left at the end."""
-        return self.ended.startswith(FINISHED)
+        return self.ending.why == Ended.FINISHED
+
+    @property
+    def ended(self) -> str:
+        """Why it ended, in a sentence."""
+        found = self.steps[-1].diagnosis
+        headline, advice = ("", "") if found is None else (found.headline, found.advice)
+        return sentences.ended(self.ending, self.errors[-1], headline, advice)
 
     @property
     def conclusion(self) -> Conclusion:
         """Whether the last model may be used, and what became of the error."""
         error, last = self.errors[-1], self.fit.conclusion
-        if last.light == Light.RED or error >= CLOSE:
+        if last.light == Light.RED or error >= rules.CLOSE:
             light = Light.RED
         else:
-            light = last.light if self.finished and error < FITS else Light.AMBER
-        doubt = "" if last.light == Light.GREEN else f" {last.sentence}"
-        return Conclusion(light, f"{self._in_short()}{doubt}")
-
-    def _in_short(self) -> str:
-        """What was added, what became of the error, why the story ended."""
+            light = last.light if self.finished and error < rules.FITS else Light.AMBER
+        doubt = "" if last.light == Light.GREEN else last.sentence
+        found = self.steps[-1].diagnosis
+        ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
         added = [step.added for step in self.steps if step.added]
-        head, _, _ = self.ended.partition(". ")  # the rest, what was tried in vain, is in `ended`
-        head = head.partition(": ")[0].removesuffix(".").replace(f" (error {self.errors[-1]:.2f})", "")
         if not added:
-            return f"{head} (error {number(self.errors[-1])})."
-        first, last = self.errors[0], self.errors[-1]
-        how = "fell" if last < first else "went"
-        ended = head[0].lower() + head[1:]
-        return f"Added {', '.join(added)}, and the error {how} from {number(first)} to {number(last)}; {ended}."
+            return Conclusion(light, f"{ended} (error {number(error)}).", doubt)
+        head = sentences.added_in_short(added, self.errors[0], error)
+        return Conclusion(light, head, f"{ended}. {doubt}".rstrip())
 
     @property
     def start(self) -> str:
@@ -119,22 +117,20 @@ class Story:
     @property
     def details(self) -> tuple[str, ...]:
         """What was added in each step, why, how large it is, and what else moved, in sentences."""
-        told = []
+        said = []
         for i, step in enumerate(self.steps):
             reason = self._reason(i)
-            told += [f"- {reason}"] if reason else []
-            told += [f"  {sentence}" for sentence in (*step.sizes, *step.moved)]
-        return tuple(told)
+            said += [f"- {reason}"] if reason else []
+            said += [f"  {sentence}" for sentence in (*step.sizes, *step.moved)]
+        return tuple(said)
 
     def _reason(self, i: int) -> str:
         """Why step `i` was taken; empty for the first."""
         step, before = self.steps[i], self.steps[i - 1]
         if not step.added:
             return ""
-        errors = f"{before.comparison.error:.2f} -> {step.comparison.error:.2f}"
-        return (
-            f"Step {i}: added {step.added}, because {_because(before, step)}; error {errors}{together(before, step)}."
-        )
+        errors = before.comparison.error, step.comparison.error
+        return sentences.added(i, step.added, _because(before, step), *errors, together(before, step))
 
     @property
     def _closing(self) -> tuple[str, ...]:
@@ -144,7 +140,7 @@ class Story:
     @property
     def care(self) -> str:
         """What to mind of the last fit; empty if it converged."""
-        return "" if self.fit.converged else f"Read its numbers with care, the last fit has {self.fit.outcome}."
+        return "" if self.fit.converged else sentences.with_care(self.fit.outcome)
 
     def plot(self):
         """A figure of the error falling: `hsnoise.plots.story`."""
@@ -194,29 +190,11 @@ def together(before: Step, after: Step) -> str:
     """What fell, in words, where an addition was kept although the error, that of the worst group, did not fall."""
     if after.comparison.error <= before.comparison.error:
         return ""
-    sums = [sum(step.comparison.groups.values()) for step in (before, after)]
-    return f", misfit of all groups together {number(sums[0])} -> {number(sums[1])}"
-
-
-def _sizes(result: FitResult, name: str) -> tuple[str, ...]:
-    rows = [(n, row) for n, row in result.table.items() if n == name or n.startswith(f"{name}.")]
-    told = []
-    for label, (value, error, unit) in rows:
-        size, of = rounded(value, error)
-        of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
-        told.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip())
-    chosen = result.params[name].settings().items()
-    told += [f"{name}.{field}: {value}" for field, value in chosen if value is not None]
-    return tuple(f"{sentence}." for sentence in told)
+    return sentences.fell_together(*(sum(step.comparison.groups.values()) for step in (before, after)))
 
 
 def _because(before: Step, after: Step) -> str:
-    found, reasons = before.diagnosis, nearer(before.comparison, after.comparison)
-    if reasons:
-        reason = reasons[0]
-    else:
-        score = next((one.score for one in found.ranking if one.name == after.added), 0.0) if found else 0.0
-        reason = f"its fingerprint is in the statistics (score {score:.0f} nats)"
-    if found is not None and found.verdict == "unexplained" and after.comparison.error > CHANCE_ERROR:
-        return f"{reason} (no effect explains all that is off; this one comes nearest)"
-    return reason
+    found, ranking = before.diagnosis, () if before.diagnosis is None else before.diagnosis.ranking
+    score = next((one.score for one in ranking if one.name == after.added), 0.0)
+    is_nearest = found is not None and found.verdict == Verdict.UNEXPLAINED and not after.comparison.fits
+    return sentences.because(nearer(before.comparison, after.comparison), score, is_nearest)

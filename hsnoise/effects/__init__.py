@@ -5,7 +5,9 @@ May import `_core` alone; two effects never see each other.
 
 from __future__ import annotations
 
-from hsnoise.effects._base import AbstractEffect, Capture, Parameter, ParameterSpec, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, Places, either_side
+from hsnoise.effects._parameters import Parameter, ParameterSpec, param
 from hsnoise.effects.adc import ADC
 from hsnoise.effects.amplifier_glow import AmplifierGlow
 from hsnoise.effects.black_clamp import BlackClamp
@@ -86,6 +88,7 @@ __all__ = [
     "BlackLevel",
     "BlackShading",
     "Capture",
+    "CaptureFacts",
     "ColumnFixedPattern",
     "ColumnNoise",
     "CosmicRays",
@@ -100,6 +103,7 @@ __all__ = [
     "HeavyTailedReadNoise",
     "HotPixels",
     "ImageLag",
+    "Maker",
     "MissingCodes",
     "Nonlinearity",
     "OddEvenPattern",
@@ -107,6 +111,7 @@ __all__ = [
     "ParameterSpec",
     "PeriodicBanding",
     "PhotoResponseNonuniformity",
+    "Places",
     "RandomTelegraphNoise",
     "ReadNoise",
     "ReadNoiseNonuniformity",
@@ -119,5 +124,6 @@ __all__ = [
     "ShotNoise",
     "Stage",
     "TapOffsets",
+    "either_side",
     "param",
 ]

@@ -18,7 +18,7 @@ An effect of one's own is a class of about 20 lines in one's own file:
 import abc
 import dataclasses
 import enum
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -40,6 +40,8 @@ from hsnoise._core.types import (
     channels_of,
     is_traced,
 )
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import Parameter, ParameterSpec, shortest
 
 LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
 
@@ -59,69 +61,6 @@ class Stage(enum.IntEnum):
     GAIN = 6  # multiplies; after this stage the signal is in DN
     BLACK = 7  # adds an offset, DN
     DIGITAL = 8  # turns DN into counts, or counts into counts
-
-
-@dataclasses.dataclass(frozen=True)
-class ParameterSpec:
-    """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning, whether held."""
-
-    unit: str
-    low: float | None
-    high: float | None
-    per_channel: bool
-    doc: str
-    held: bool | Literal["at bounds"]
-
-    def holds(self, value: float) -> bool:
-        """Whether a fit leaves a parameter of this value where it is."""
-        return value in (self.low, self.high) if self.held == "at bounds" else self.held
-
-
-@dataclasses.dataclass(frozen=True)
-class Parameter:
-    """One number of a model: name in tables, `<effect>.<parameter>[.<channel>]`, value and declaration."""
-
-    name: str
-    value: float
-    spec: ParameterSpec
-
-
-def _as_leaf(x):
-    # An array keeps its own precision: a fit hands over float64 whatever the session uses.
-    if eqx.is_inexact_array(x) and isinstance(x, jax.Array):
-        return x
-    try:
-        return jnp.asarray(x, float)
-    except (TypeError, ValueError):
-        return x  # no number: `__check_init__`, which knows the parameter's name, says so
-
-
-def param(
-    unit: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    per_channel: bool = False,
-    default: float | None = None,
-    doc: str = "",
-    held: bool | Literal["at bounds"] = False,
-) -> Any:
-    """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
-
-    Args:
-        unit: its unit, "1" if it has none.
-        low, high: inclusive bounds; None for unbounded.
-        per_channel: one value per colour channel; a scalar given instead holds for all channels.
-        default: value unless one is given; None: one must be given.
-        doc: its meaning in a few words.
-        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly. "at bounds": only
-            if it lies at one, such as a place at the edge of the frame.
-    """
-    spec = ParameterSpec(unit, low, high, per_channel, doc, held)
-    metadata = {"parameter": spec}
-    if default is None:
-        return eqx.field(converter=_as_leaf, metadata=metadata)
-    return eqx.field(converter=_as_leaf, metadata=metadata, default=default)
 
 
 class Capture(eqx.Module):
@@ -187,6 +126,25 @@ class Capture(eqx.Module):
         """The key from which the effect called `name` draws what never changes on this sensor."""
         return named_key(self.sensor_key, name)
 
+    def offset_variance(self, variance_e2: float, after_gain: bool = False) -> float:
+        """What an offset of this variance, e-^2, adds to the variance of counts, DN^2: the mean over all pixels."""
+        if self.gain is None:
+            return float(variance_e2)
+        gain = np.asarray(self.gain, float)[cfa_tile(self.cfa)]
+        return float(variance_e2 * (gain.mean() ** 2 if after_gain else (gain**2).mean()))
+
+    def spread_of_lines(self, axis: int, power: np.ndarray | jax.Array) -> tuple[float, float]:
+        """How a stationary series over the rows (axis 0) or columns (1) of a frame divides between its components.
+
+        The shares of its variance in the lines and in the frame as a whole, as the three-dimensional decomposition of
+        one colour estimates them: (1, 0) of white noise; the second is negative where the series has no mean.
+
+        power: its spectrum, of mean 1, at 0 ... n - 1 cycles per frame.
+        """
+        lines = self.shape[axis] // len(cfa_tile(self.cfa))
+        dc = float(np.mean(np.asarray(power)[::lines]))  # every line of one colour: frequencies fold
+        return (lines - dc) / (lines - 1), (dc - 1) / (lines - 1)
+
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the channels."""
@@ -215,21 +173,32 @@ class AbstractEffect(eqx.Module):
     """One physical effect. Subclasses are final: give `name`, `stage`, parameters by `param`, and `sample`.
 
     What is not a physical parameter (a clipping level, a choice) is an `eqx.field(static=True)` that JSON can
-    hold.
+    hold. What else it may say about itself: how strong it may be (`propose`), what variance it adds (`components`), a
+    number in which it shows (`statistics`).
 
     Attributes:
         name: name in tables and files, unique in a model; the effect's random key derives from it.
         stage: where in the sensor it acts.
         in_series: whether what happens in a frame depends on those before it, or on how many there were.
         adds: whether it adds electrons that do not depend on the signal.
+        in_likelihood: whether the exact likelihood of row histograms knows it; else simulated statistics fit it.
         stream: name of its random key; its own name if empty.
+        least_frames: frames of one exposure that it takes to show it.
+        selection_nats: what its score must make up for a detail that is read off the capture and not drawn at random.
+        confounded_with: what changes darks as it does, so that only flats tell the two apart; empty if nothing does.
+        decided_by: the capture that tells them apart, in words that go on "... ".
     """
 
     name: eqx.AbstractClassVar[str]
     stage: eqx.AbstractClassVar[Stage]
     in_series: ClassVar[bool] = False
     adds: ClassVar[bool] = False
+    in_likelihood: ClassVar[bool] = False
     stream: ClassVar[str] = ""
+    least_frames: ClassVar[int] = 1
+    selection_nats: ClassVar[float] = 0.0
+    confounded_with: ClassVar[str] = ""
+    decided_by: ClassVar[str] = ""
 
     @property
     def acts_at(self) -> Stage:
@@ -253,6 +222,37 @@ class AbstractEffect(eqx.Module):
     ) -> Frames | PixelMap | None:
         """Factor on the dark current of each pixel, as `read_noise_scale`, but of mean 1: the rate stays the mean."""
         return None
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        """How strong it may be in a capture that may lack it, or None if this capture cannot show it.
+
+        Returns:
+            A function of an amplitude and a NumPy generator that makes the effect. At an amplitude of 1 it is modest:
+            a few standard errors in the statistics that it moves. Details that nobody knows (a period, a corner) are
+            drawn from the generator, so that it is recognised whatever they are.
+
+        By default None: `diagnose` tries it only if the user hands over an instance.
+        """
+        return None
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        """What it adds to the components of the three-dimensional decomposition of dark frames, DN^2, by formula.
+
+        Keys of `hsnoise.budget`: frame, row, column, row_x_frame, column_x_frame, pixel, temporal. Means over all
+        pixels and all sensors of the make, without row gain, rounding and clipping. Empty, the default, if there is no
+        simple formula: then draws tell.
+        """
+        return {}
+
+    @classmethod
+    def statistics(cls, frames: np.ndarray) -> dict[str, float]:
+        """Numbers of its own in which it shows, by name, of frames [frame, row, column] of one exposure.
+
+        Counts are above black, DN. A measured capture and draws of a model are compared by them, beside what all
+        captures are compared by. None by default.
+        """
+        return {}
 
     def __check_init__(self):
         if not (isinstance(self.name, str) and self.name.isidentifier()):
@@ -324,11 +324,6 @@ def _shown(value: Any) -> str:
     if not isinstance(value, jax.Array | np.ndarray) or is_traced(value):
         return eqx.tree_pformat(value)
     return np.array2string(np.asarray(value), separator=", ", precision=6)
-
-
-def shortest(value: np.ndarray | np.floating) -> float:
-    """The number of fewest digits that reads back as `value` in its precision: 0.1, not 0.10000000149."""
-    return float(str(value))
 
 
 def draw_poisson(key: RandomKey, mean: jax.Array, shape: tuple[int, ...]) -> Frames:

@@ -23,6 +23,7 @@ class ADC(AbstractEffect):
 
     name: ClassVar[str] = "adc"
     stage: ClassVar[Stage] = Stage.DIGITAL
+    in_likelihood: ClassVar[bool] = True
     white_level_dn: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

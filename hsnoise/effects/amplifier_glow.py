@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class AmplifierGlow(AbstractEffect):
@@ -27,7 +30,9 @@ class AmplifierGlow(AbstractEffect):
     name: ClassVar[str] = "amplifier_glow"
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
-    rate: Scalar = param("e-/s", low=0, doc="electrons of a pixel in a second where the glow is brightest")
+    rate: Scalar = param(
+        "e-/s", low=0, amplitude=True, doc="electrons of a pixel in a second where the glow is brightest"
+    )
     scale: Scalar = param("1", low=0.01, doc="distance over which the glow falls by e, in diagonals of the frame")
     row: Scalar = param(
         "1", low=0, high=1, default=1.0, held="at bounds", doc="row of the brightest spot: 0 the first, 1 the last"
@@ -46,3 +51,16 @@ class AmplifierGlow(AbstractEffect):
         distance = jnp.sqrt(squared + 1e-12)
         mean = self.rate * capture.exposure_s * jnp.exp(-distance / self.scale)
         return signal + draw_poisson(key, mean[None], signal.shape)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.has_exposure:
+            return None
+        row, column = facts.places.glow
+
+        def make(size: float, rng: np.random.Generator) -> AmplifierGlow:
+            # Nearly as bright in its corner as the noise of a pixel, over a sixth to half of the frame, wide or high.
+            peak = 0.8 * size * max(facts.read_noise_e, np.sqrt(facts.dark_e))
+            return cls(peak / facts.longest_s, rng.uniform(0.15, 0.5), row, column, rng.choice([0.7, 1.0, 1.5]))
+
+        return make

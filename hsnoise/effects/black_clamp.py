@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, PerChannel, RandomKey
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class BlackClamp(AbstractEffect):
@@ -22,7 +24,20 @@ class BlackClamp(AbstractEffect):
 
     name: ClassVar[str] = "black_clamp"
     stage: ClassVar[Stage] = Stage.BLACK
-    rate: PerChannel = param("DN/s", low=0, per_channel=True, doc="dark level that the camera subtracts")
+    in_likelihood: ClassVar[bool] = True
+    confounded_with: ClassVar[str] = "gain"
+    decided_by: ClassVar[str] = "flats (evenly lit frames of two or more brightnesses) measure the gain by itself"
+    rate: PerChannel = param(
+        "DN/s", low=0, per_channel=True, amplitude=True, doc="dark level that the camera subtracts"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return signal - capture.per_pixel(self.rate * capture.exposure_s)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not (facts.exposures_differ and facts.shows_dark_current):
+            return None
+        # Most of the dark current that the fit found, all at most: a clamp takes a share of what there is.
+        level = facts.gain * facts.dark_e_per_s
+        return lambda size, rng: cls(level * min(0.7 * size, 1.0))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, PerChannel, RandomKey
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._parameters import param
 
 
 class BlackLevel(AbstractEffect):
@@ -13,6 +14,7 @@ class BlackLevel(AbstractEffect):
 
     name: ClassVar[str] = "black_level"
     stage: ClassVar[Stage] = Stage.BLACK
+    in_likelihood: ClassVar[bool] = True
     value: PerChannel = param("DN", per_channel=True, doc="mean count of a pixel without electrons")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

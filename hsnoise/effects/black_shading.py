@@ -6,9 +6,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class BlackShading(AbstractEffect):
@@ -30,7 +33,8 @@ class BlackShading(AbstractEffect):
 
     name: ClassVar[str] = "black_shading"
     stage: ClassVar[Stage] = Stage.BLACK
-    amplitude: Scalar = param("DN", low=0, doc="rms over the columns (rows)")
+    least_frames: ClassVar[int] = 2
+    amplitude: Scalar = param("DN", low=0, amplitude=True, doc="rms over the columns (rows)")
     length: Scalar = param("1", low=0.003, doc="where it has fallen by e, in widths (heights) of the frame")
     axis: str = eqx.field(static=True, default="column")
     start: str = eqx.field(static=True, default="first")
@@ -53,3 +57,14 @@ class BlackShading(AbstractEffect):
         shape = (shape if self.above else -shape)[:: 1 if self.start == "first" else -1]
         here = shape[capture.columns if over_columns else capture.rows]
         return signal + (here[None, None] if over_columns else here[None, :, None])
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A fifth of the read noise, where the capture bends; how fast is read off to a factor of two.
+        axis, start, above, length = facts.places.shading
+
+        def make(size: float, rng: np.random.Generator) -> BlackShading:
+            rms_dn = 0.2 * size * facts.read_noise_e * float(facts.gain.mean())
+            return cls(rms_dn, length * np.exp(rng.uniform(-0.7, 0.7)), axis, start, above)
+
+        return make

@@ -8,7 +8,9 @@ import equinox as eqx
 import jax
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class ColumnFixedPattern(AbstractEffect):
@@ -27,10 +29,18 @@ class ColumnFixedPattern(AbstractEffect):
 
     name: ClassVar[str] = "column_fixed_pattern"
     stage: ClassVar[Stage] = Stage.READ
-    sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over columns")
     after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         _, _, columns = signal.shape
         pattern = jax.random.normal(capture.fixed_key(self.name), (1, 1, columns), signal.dtype)
         return signal + capture.offset(self.sigma * pattern, self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A fifth of the read noise, as of fixed rows: averaging frames brings it out.
+        return lambda size, rng: cls(0.2 * size * facts.read_noise_e, either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        return {"column": capture.offset_variance(self.sigma**2, self.after_gain)}

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 
 from hsnoise._core.coloured import coloured_normal, fading_power
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class ColumnNoise(AbstractEffect):
@@ -30,7 +32,7 @@ class ColumnNoise(AbstractEffect):
 
     name: ClassVar[str] = "column_noise"
     stage: ClassVar[Stage] = Stage.READ
-    sigma: Scalar = param("e-", low=0, doc="standard deviation over columns")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over columns")
     exponent: Scalar = param("1", default=0.0, doc="power falls as column frequency to minus this: 0 white, 1 is 1/f")
     after_gain: bool = eqx.field(static=True, default=False)
 
@@ -38,3 +40,14 @@ class ColumnNoise(AbstractEffect):
         frames, _, columns = signal.shape
         series = coloured_normal(key, (frames, columns, 1), fading_power(columns, self.exponent), signal.dtype)
         return signal + capture.offset(self.sigma * jnp.swapaxes(series, 1, 2), self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # As row noise: a quarter of the read noise stands out of the means of columns.
+        read = facts.read_noise_e
+        return lambda size, rng: cls(0.25 * size * read, rng.choice([0.0, 1.0]), either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        variance = capture.offset_variance(self.sigma**2, self.after_gain)
+        lines, whole = capture.spread_of_lines(1, fading_power(capture.shape[1], self.exponent))
+        return {"column_x_frame": lines * variance, "frame": whole * variance}

@@ -6,9 +6,12 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class CosmicRays(AbstractEffect):
@@ -26,10 +29,17 @@ class CosmicRays(AbstractEffect):
     name: ClassVar[str] = "cosmic_rays"
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
-    rate: Scalar = param("1/(Mpixel s)", low=0, held="at bounds", doc="hits of a million pixels in a second")
+    rate: Scalar = param(
+        "1/(Mpixel s)", low=0, held="at bounds", amplitude=True, doc="hits of a million pixels in a second"
+    )
     charge: Scalar = param("e-", low=0, doc="mean charge of a hit")
     at_readout: Scalar = param(
-        "1/Mpixel", low=0, default=0.0, held="at bounds", doc="hits of a million pixels whatever the exposure"
+        "1/Mpixel",
+        low=0,
+        default=0.0,
+        held="at bounds",
+        amplitude=True,
+        doc="hits of a million pixels whatever the exposure",
     )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
@@ -41,3 +51,21 @@ class CosmicRays(AbstractEffect):
         hit = (one < root) & (other < root)
         charge = jnp.round(self.charge * jax.random.exponential(how_much, signal.shape, signal.dtype))
         return signal + jnp.where(hit, charge, 0)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        def make(size: float, rng: np.random.Generator) -> CosmicRays:
+            hits = 40.0 * size  # of a million pixels: a few in each frame of a small capture
+            if not facts.has_exposure:
+                return cls(0.0, rng.uniform(15, 80) * facts.read_noise_e, hits)
+            at_readout = rng.choice([0.05, 0.5, 0.95])  # of the hits in the longest exposure
+            charge = rng.uniform(15, 80) * facts.read_noise_e  # far above the read noise
+            return cls(hits * (1 - at_readout) / facts.longest_s, charge, hits * at_readout)
+
+        return make
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        probability = -np.expm1(-1e-6 * float(self.rate * capture.exposure_s + self.at_readout))
+        # Exponential charges have twice the square of their mean as their mean square.
+        square = probability * (2 - probability) * float(self.charge) ** 2
+        return {"temporal": capture.offset_variance(square)}

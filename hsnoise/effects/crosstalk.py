@@ -7,7 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class Crosstalk(AbstractEffect):
@@ -27,7 +29,9 @@ class Crosstalk(AbstractEffect):
 
     name: ClassVar[str] = "crosstalk"
     stage: ClassVar[Stage] = Stage.COUPLING
-    fraction: Scalar = param("1", low=0, high=0.25, doc="part of a pixel's electrons that each neighbour gets")
+    fraction: Scalar = param(
+        "1", low=0, high=0.25, amplitude=True, doc="part of a pixel's electrons that each neighbour gets"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         padded = jnp.pad(signal, ((0, 0), (1, 1), (1, 1)), mode="edge")
@@ -35,3 +39,8 @@ class Crosstalk(AbstractEffect):
         above, below = padded[:, :-2, inside], padded[:, 2:, inside]
         left, right = padded[:, inside, :-2], padded[:, inside, 2:]
         return signal + self.fraction * (above + below + left + right - 4 * signal)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # Four neighbours get it, and correlations are measured to some thousandths. A fifth is a mean over all five.
+        return lambda size, rng: cls(min(0.015 * size, 0.2))

@@ -7,7 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class DarkCurrentDrift(AbstractEffect):
@@ -27,9 +29,20 @@ class DarkCurrentDrift(AbstractEffect):
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
     in_series: ClassVar[bool] = True
-    slope: Scalar = param("e-/s/frame", low=0, doc="growth of the dark current from one frame to the next")
+    least_frames: ClassVar[int] = 2
+    slope: Scalar = param(
+        "e-/s/frame", low=0, amplitude=True, doc="growth of the dark current from one frame to the next"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         frame = jnp.arange(len(signal), dtype=signal.dtype)[:, None, None]
         mean = self.slope * capture.exposure_s * frame
         return signal + draw_poisson(key, mean, signal.shape)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.has_exposure:
+            return None
+        # Half of the read noise between the first and the last frame: means of frames are known far better.
+        span_s = facts.longest_s * facts.frames
+        return lambda size, rng: cls(0.5 * size * facts.read_noise_e / span_s)

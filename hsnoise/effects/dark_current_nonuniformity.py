@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, PixelMap, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class DarkCurrentNonuniformity(AbstractEffect):
@@ -26,7 +28,7 @@ class DarkCurrentNonuniformity(AbstractEffect):
     name: ClassVar[str] = "dark_current_nonuniformity"
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
-    spread: Scalar = param("1", low=0, doc="standard deviation of ln dark current over pixels")
+    spread: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of ln dark current over pixels")
 
     def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:
         z = jax.random.normal(capture.fixed_key(self.name), (1, *shape[1:]))
@@ -35,3 +37,11 @@ class DarkCurrentNonuniformity(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal unchanged: the effect that draws the dark current applies the scale."""
         return signal
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not (facts.exposures_differ and facts.shows_dark_current):
+            return None
+        # A third of the read noise in the longest exposure, as of offsets. Beyond 1.5, a few pixels have all of it.
+        grain = 0.35 * facts.read_noise_e / facts.dark_e
+        return lambda size, rng: cls(min(grain * size, 1.5))

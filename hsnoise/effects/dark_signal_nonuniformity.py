@@ -8,7 +8,9 @@ import equinox as eqx
 import jax
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class DarkSignalNonuniformity(AbstractEffect):
@@ -28,9 +30,17 @@ class DarkSignalNonuniformity(AbstractEffect):
 
     name: ClassVar[str] = "dark_signal_nonuniformity"
     stage: ClassVar[Stage] = Stage.READ
-    sigma: Scalar = param("e-", low=0, doc="standard deviation over pixels")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over pixels")
     after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         pattern = jax.random.normal(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
         return signal + capture.offset(self.sigma * pattern, self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A third of the read noise: a pixel has only its few frames to show it.
+        return lambda size, rng: cls(0.35 * size * facts.read_noise_e, either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        return {"pixel": capture.offset_variance(self.sigma**2, self.after_gain)}

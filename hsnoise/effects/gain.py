@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, PerChannel, RandomKey
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._parameters import param
 
 
 class Gain(AbstractEffect):
@@ -16,6 +17,7 @@ class Gain(AbstractEffect):
 
     name: ClassVar[str] = "gain"
     stage: ClassVar[Stage] = Stage.GAIN
+    in_likelihood: ClassVar[bool] = True
     value: PerChannel = param("DN/e-", low=0, per_channel=True, doc="system gain")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

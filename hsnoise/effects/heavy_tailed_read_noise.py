@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import jax
@@ -9,7 +10,9 @@ import jax.numpy as jnp
 from jax.scipy.special import gammainc, gammaincc, gammaln
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 LARGEST_LOGIT = 22.9  # of a uniform number of 32 bits
 KNOTS, FINE_KNOTS = 1024, 4096
@@ -30,7 +33,9 @@ class HeavyTailedReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "heavy_tailed_read_noise"
     stage: ClassVar[Stage] = Stage.READ
-    dof: Scalar = param("1", low=2.05, doc="degrees of freedom of Student's t; infinite is normal")
+    dof: Scalar = param(
+        "1", low=2.05, amplitude=True, absent=math.inf, doc="degrees of freedom of Student's t; infinite is normal"
+    )
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> Frames:
         # chi2(dof) is twice a gamma variable of dof / 2.
@@ -40,6 +45,11 @@ class HeavyTailedReadNoise(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal unchanged: the effect that draws the read noise applies the scale."""
         return signal
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # Six degrees of freedom: an excess kurtosis of 3.
+        return lambda size, rng: cls(2.05 + 4.0 / size)
 
 
 def _log_gamma(key: RandomKey, a: Scalar, shape: tuple[int, ...]) -> jax.Array:

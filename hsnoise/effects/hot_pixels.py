@@ -6,9 +6,12 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 PAIRS = 1  # what sets the random key of electrons that come in pairs apart
 
@@ -35,9 +38,14 @@ class HotPixels(AbstractEffect):
     stage: ClassVar[Stage] = Stage.ELECTRONS
     adds: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that are hot")
-    rate: Scalar = param("e-/s", low=0, held="at bounds", doc="mean extra dark current of a hot pixel")
+    rate: Scalar = param("e-/s", low=0, held="at bounds", amplitude=True, doc="mean extra dark current of a hot pixel")
     at_readout: Scalar = param(
-        "e-", low=0, default=0.0, held="at bounds", doc="mean extra electrons of a hot pixel whatever the exposure"
+        "e-",
+        low=0,
+        default=0.0,
+        held="at bounds",
+        amplitude=True,
+        doc="mean extra electrons of a hot pixel whatever the exposure",
     )
     fano: Scalar = param("1", low=0.5, high=1, default=1.0, held="at bounds", doc="variance over mean of hot charge")
 
@@ -56,3 +64,28 @@ class HotPixels(AbstractEffect):
             return jnp.floor((draw_poisson(steps, 2 * in_pairs * mean, signal.shape) + begun) / 2)
 
         return signal + single + jax.lax.cond(in_pairs > 0, second_steps, lambda: jnp.zeros_like(signal))
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        def make(size: float, rng: np.random.Generator) -> HotPixels:
+            # From just above the read noise to far beyond it, in three pixels of a thousand: a few dozen in any frame.
+            charge = np.exp(rng.uniform(np.log(4), np.log(120))) * facts.read_noise_e
+            fraction = min(0.003 * size, 0.2)
+            if not facts.has_exposure:  # collected while bias frames wait to be read
+                return cls(fraction, 0.0, charge)
+            rate = charge / facts.longest_s
+            # In some sensors a hundredth of the charge while a frame waits to be read, which only a bias frame tells.
+            return cls(fraction, rate, rng.choice([0.0, 0.01]) * rate * facts.longest_s if facts.has_bias else 0.0)
+
+        return make
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        if self.fano < 1:  # the variance of a few electrons in pairs has no simple formula
+            return {}
+        mean = float(self.rate * capture.exposure_s + self.at_readout)
+        # Exponential charges have twice the square of their mean as their mean square.
+        static = float(self.fraction * (2 - self.fraction)) * mean**2
+        return {
+            "pixel": capture.offset_variance(static),
+            "temporal": capture.offset_variance(float(self.fraction) * mean),
+        }

@@ -7,7 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class ImageLag(AbstractEffect):
@@ -26,8 +28,18 @@ class ImageLag(AbstractEffect):
     name: ClassVar[str] = "image_lag"
     stage: ClassVar[Stage] = Stage.COUPLING
     in_series: ClassVar[bool] = True
-    fraction: Scalar = param("1", low=0, high=1, doc="part of the electrons that stays for the next frame")
+    least_frames: ClassVar[int] = 2
+    fraction: Scalar = param(
+        "1", low=0, high=1, amplitude=True, doc="part of the electrons that stays for the next frame"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         previous = jnp.concatenate([signal[:1], signal[:-1]])
         return signal + self.fraction * (previous - signal)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.shows_signal:
+            return None
+        # Correlations of consecutive frames are measured to some thousandths. Half is the mean of two frames.
+        return lambda size, rng: cls(min(0.03 * size, 0.5))

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.types import Counts, Frames, RandomKey, Scalar
-from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class MissingCodes(AbstractEffect):
@@ -30,7 +32,9 @@ class MissingCodes(AbstractEffect):
 
     name: ClassVar[str] = "missing_codes"
     stage: ClassVar[Stage] = Stage.DIGITAL
-    gain: Scalar = param("1", low=1, held=True, doc="digital gain: distance of two codes, DN; fits hold it")
+    gain: Scalar = param(
+        "1", low=1, held=True, amplitude=True, absent=1, doc="digital gain: distance of two codes, DN; fits hold it"
+    )
     white_level_dn: float | None = eqx.field(static=True, default=None)
 
     def sample(self, signal: Frames | Counts, capture: Capture, *, key: RandomKey) -> Frames | Counts:
@@ -39,3 +43,8 @@ class MissingCodes(AbstractEffect):
         limit = np.iinfo(np.uint16).max if signal.dtype == jnp.uint16 else LARGEST_UINT32
         white = limit if self.white_level_dn is None else min(self.white_level_dn, limit)
         return jnp.minimum(stretched, white).astype(signal.dtype)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # The gain that left gaps between the codes. If there are none, any gain, and the counts speak against it.
+        return lambda size, rng: cls(facts.code_step or 1.0 + min(size, 1.0) * rng.uniform(0.1, 1.5))

@@ -7,7 +7,11 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
+
+LEVELS_OF_A_CURVE = 3  # a straight line goes through any two
 
 
 class Nonlinearity(AbstractEffect):
@@ -25,10 +29,17 @@ class Nonlinearity(AbstractEffect):
 
     name: ClassVar[str] = "nonlinearity"
     stage: ClassVar[Stage] = Stage.READOUT
-    curvature: Scalar = param("1/e-", doc="relative loss of response for each electron of signal")
+    curvature: Scalar = param("1/e-", amplitude=True, doc="relative loss of response for each electron of signal")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         bends = self.curvature > 0
         summit = jnp.where(bends, 0.5 / jnp.where(bends, self.curvature, 1), jnp.inf)
         positive = jnp.clip(signal, 0, summit)
         return jnp.minimum(signal, summit) - self.curvature * positive**2
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.shows_signal or facts.levels < LEVELS_OF_A_CURVE:
+            return None
+        # A loss of 8 % at the brightest level, its noise included: the summit stays out of reach.
+        return lambda size, rng: cls(0.08 * size / (facts.signal_e + 2 * facts.read_noise_e))

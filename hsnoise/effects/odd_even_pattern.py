@@ -7,7 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class OddEvenPattern(AbstractEffect):
@@ -25,11 +27,18 @@ class OddEvenPattern(AbstractEffect):
 
     name: ClassVar[str] = "odd_even_pattern"
     stage: ClassVar[Stage] = Stage.READOUT
-    offset: Scalar = param("e-", doc="second chain minus first")
-    gain_mismatch: Scalar = param("1", low=-1, high=1, default=0.0, doc="relative gain, second chain minus first")
+    offset: Scalar = param("e-", amplitude=True, doc="second chain minus first")
+    gain_mismatch: Scalar = param(
+        "1", low=-1, high=1, default=0.0, amplitude=True, doc="relative gain, second chain minus first"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         width = 1 if capture.cfa == "mono" else 2
         chain = (capture.columns // width) % 2
         half = jnp.asarray(chain - 0.5, signal.dtype)[None, None]
         return signal * (1 + half * self.gain_mismatch) + half * self.offset
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A fifth of the read noise between the two halves of the columns, with the sign that the capture shows.
+        return lambda size, rng: cls(0.2 * size * facts.read_noise_e * facts.places.second_chain, 0.0)

@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise._core.types import Frames, RandomKey, Scalar, cfa_tile
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class PeriodicBanding(AbstractEffect):
@@ -32,7 +34,8 @@ class PeriodicBanding(AbstractEffect):
 
     name: ClassVar[str] = "periodic_banding"
     stage: ClassVar[Stage] = Stage.READ
-    amplitude: Scalar = param("e-", low=0, doc="amplitude of the sinusoid")
+    selection_nats: ClassVar[float] = 5.0  # its frequency is that of the highest of some hundred lines of the capture
+    amplitude: Scalar = param("e-", low=0, amplitude=True, doc="amplitude of the sinusoid")
     frequency: Scalar = param("cycles/pixel", low=0, high=0.5, held=True, doc="cycles per row, or column; fits hold it")
     axis: str = eqx.field(static=True, default="row")
     after_gain: bool = eqx.field(static=True, default=False)
@@ -48,3 +51,18 @@ class PeriodicBanding(AbstractEffect):
         phase = jax.random.uniform(key, (frames, 1, 1), signal.dtype, maxval=2 * np.pi)
         wave = self.amplitude * jnp.sin(2 * np.pi * self.frequency * i + phase)
         return signal + capture.offset(wave, self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A third of the read noise on the strongest line of the capture: one line of the spectrum shows it.
+        axis, frequency = facts.line
+        return lambda size, rng: cls(0.3 * size * facts.read_noise_e, frequency, axis, either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        over_rows = self.axis == "row"
+        lines, colours = capture.shape[0 if over_rows else 1], len(cfa_tile(capture.cfa))
+        mean = np.exp(2j * np.pi * float(self.frequency) * np.arange(0, lines, colours)).mean()
+        within = capture.offset_variance(self.amplitude**2 / 2, self.after_gain)
+        # As much of the sinusoid as the mean of a frame holds is no difference between its lines.
+        between = (1 - abs(mean) ** 2) * within / (1 - colours / lines)
+        return {"row_x_frame" if over_rows else "column_x_frame": between, "frame": within - between}

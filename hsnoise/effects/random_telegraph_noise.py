@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class RandomTelegraphNoise(AbstractEffect):
@@ -27,10 +29,22 @@ class RandomTelegraphNoise(AbstractEffect):
     name: ClassVar[str] = "random_telegraph_noise"
     stage: ClassVar[Stage] = Stage.READ
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that jump")
-    amplitude: Scalar = param("e-", low=0, doc="distance of the two levels")
+    amplitude: Scalar = param("e-", low=0, amplitude=True, doc="distance of the two levels")
     duty: Scalar = param("1", low=0, high=1, default=0.5, doc="probability of the high level")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where = jax.random.uniform(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
         high = jax.random.uniform(key, signal.shape, signal.dtype) < self.duty
         return signal + jnp.where((where < self.fraction) & high, self.amplitude, 0)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # Two pixels in a hundred, with jumps beyond the read noise: smaller ones show no two peaks.
+        read = facts.read_noise_e
+        return lambda size, rng: cls(0.02 * size, rng.uniform(2.5, 6.0) * read, rng.uniform(0.15, 0.85))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        square = capture.offset_variance(self.amplitude**2)
+        fraction, duty = float(self.fraction), float(self.duty)
+        static = fraction * (1 - fraction) * duty**2 * square
+        return {"pixel": static, "temporal": fraction * duty * (1 - duty) * square}

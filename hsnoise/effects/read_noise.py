@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, normal_of_pixels, param
+from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, normal_of_pixels
+from hsnoise.effects._parameters import param
 
 
 class ReadNoise(AbstractEffect):
@@ -19,9 +20,13 @@ class ReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.READ
+    in_likelihood: ClassVar[bool] = True
     stream: ClassVar[str] = PIXELS
-    sigma: Scalar = param("e-", low=0, doc="standard deviation of the read noise")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation of the read noise")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         noise = self.sigma * normal_of_pixels(key, signal)
         return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        return {"temporal": capture.offset_variance(self.sigma**2)}

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from hsnoise._core.types import Frames, PixelMap, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class ReadNoiseNonuniformity(AbstractEffect):
@@ -26,7 +28,7 @@ class ReadNoiseNonuniformity(AbstractEffect):
 
     name: ClassVar[str] = "read_noise_nonuniformity"
     stage: ClassVar[Stage] = Stage.READ
-    spread: Scalar = param("1", low=0, doc="standard deviation of ln sigma over pixels")
+    spread: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of ln sigma over pixels")
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:
         z = jax.random.normal(capture.fixed_key(self.name), (1, *shape[1:]))
@@ -35,3 +37,8 @@ class ReadNoiseNonuniformity(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal unchanged: the effect that draws the read noise applies the scale."""
         return signal
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # Sigmas that differ by a third, as the sample sigmas of five frames do by chance.
+        return lambda size, rng: cls(0.3 * size)

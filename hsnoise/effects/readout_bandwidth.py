@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param, step_from_previous
+from hsnoise.effects._base import AbstractEffect, Capture, Stage, step_from_previous
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class ReadoutBandwidth(AbstractEffect):
@@ -23,7 +25,12 @@ class ReadoutBandwidth(AbstractEffect):
 
     name: ClassVar[str] = "readout_bandwidth"
     stage: ClassVar[Stage] = Stage.READOUT
-    fraction: Scalar = param("1", low=0, high=1, doc="part of the previous pixel in a pixel's reading")
+    fraction: Scalar = param("1", low=0, high=1, amplitude=True, doc="part of the previous pixel in a pixel's reading")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return signal - self.fraction * step_from_previous(signal)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # Correlations of neighbours are measured to some thousandths.
+        return lambda size, rng: cls(0.03 * size)

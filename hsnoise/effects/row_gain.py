@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from hsnoise._core.coloured import coloured_normal, row_gain_power
 from hsnoise._core.types import Frames, PerChannel, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._parameters import param
 
 
 class RowGain(AbstractEffect):
@@ -31,7 +32,10 @@ class RowGain(AbstractEffect):
 
     name: ClassVar[str] = "row_gain"
     stage: ClassVar[Stage] = Stage.GAIN
-    sigma: PerChannel = param("1", low=0, per_channel=True, doc="standard deviation of the gain over rows")
+    in_likelihood: ClassVar[bool] = True
+    sigma: PerChannel = param(
+        "1", low=0, per_channel=True, amplitude=True, doc="standard deviation of the gain over rows"
+    )
     exponent: Scalar = param("1", doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
     white_share: Scalar = param(
         "1", low=0, high=1, default=0.0, held="at bounds", doc="share of the variance that is white; fits hold 0 and 1"

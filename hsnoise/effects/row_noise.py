@@ -8,7 +8,9 @@ import equinox as eqx
 
 from hsnoise._core.coloured import coloured_normal, fading_power
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class RowNoise(AbstractEffect):
@@ -30,7 +32,7 @@ class RowNoise(AbstractEffect):
 
     name: ClassVar[str] = "row_noise"
     stage: ClassVar[Stage] = Stage.READ
-    sigma: Scalar = param("e-", low=0, doc="standard deviation over rows")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over rows")
     exponent: Scalar = param("1", default=0.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
     after_gain: bool = eqx.field(static=True, default=False)
 
@@ -38,3 +40,14 @@ class RowNoise(AbstractEffect):
         frames, rows, _ = signal.shape
         offset = self.sigma * coloured_normal(key, (frames, rows, 1), fading_power(rows, self.exponent), signal.dtype)
         return signal + capture.offset(offset, self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A quarter of the read noise: little in a pixel, many standard errors in the means of rows.
+        read = facts.read_noise_e
+        return lambda size, rng: cls(0.25 * size * read, rng.choice([0.0, 1.0]), either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        variance = capture.offset_variance(self.sigma**2, self.after_gain)
+        lines, whole = capture.spread_of_lines(0, fading_power(capture.shape[0], self.exponent))
+        return {"row_x_frame": lines * variance, "frame": whole * variance}

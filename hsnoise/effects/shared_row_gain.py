@@ -8,7 +8,9 @@ import jax.numpy as jnp
 
 from hsnoise._core.coloured import coloured_normal, row_gain_power
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
 
 
 class SharedRowGain(AbstractEffect):
@@ -26,7 +28,7 @@ class SharedRowGain(AbstractEffect):
 
     name: ClassVar[str] = "shared_row_gain"
     stage: ClassVar[Stage] = Stage.GAIN
-    sigma: Scalar = param("1", low=0, doc="standard deviation of the common gain over rows")
+    sigma: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of the common gain over rows")
     exponent: Scalar = param("1", default=1.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
@@ -36,3 +38,11 @@ class SharedRowGain(AbstractEffect):
         series = coloured_normal(key, (frames, rows, 1), power, signal.dtype)
         # The clip stands between product and sum, as in row_gain.
         return signal * (1 + jnp.maximum(self.sigma * series, -1))
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if facts.cfa == "mono" and "row_gain" in facts.effects:  # of one colour, it is the same
+            return None
+        # A tenth, as the paper's cameras have for each colour.
+        exponents = [0.0] if facts.shutter == "global" else [0.0, 1.0]
+        return lambda size, rng: cls(0.1 * size, rng.choice(exponents))

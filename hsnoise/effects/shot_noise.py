@@ -16,6 +16,7 @@ class ShotNoise(AbstractEffect):
 
     name: ClassVar[str] = "shot_noise"
     stage: ClassVar[Stage] = Stage.PHOTONS
+    in_likelihood: ClassVar[bool] = True
     stream: ClassVar[str] = PIXELS
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:

@@ -8,7 +8,9 @@ import equinox as eqx
 import jax
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, param
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
 
 
 class TapOffsets(AbstractEffect):
@@ -29,7 +31,7 @@ class TapOffsets(AbstractEffect):
 
     name: ClassVar[str] = "tap_offsets"
     stage: ClassVar[Stage] = Stage.READ
-    sigma: Scalar = param("e-", low=0, doc="standard deviation over taps")
+    sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over taps")
     taps: int = eqx.field(static=True, default=4)
     after_gain: bool = eqx.field(static=True, default=False)
 
@@ -41,3 +43,9 @@ class TapOffsets(AbstractEffect):
         tap = capture.columns * self.taps // capture.sensor_shape[1]
         offsets = jax.random.normal(capture.fixed_key(self.name), (self.taps,), signal.dtype)
         return signal + capture.offset(self.sigma * offsets[tap][None, None], self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker:
+        # A quarter of the read noise between blocks of many columns; sensors have two outputs, four or eight.
+        read = facts.read_noise_e
+        return lambda size, rng: cls(0.25 * size * read, int(rng.choice([2, 4, 8])), either_side(rng))

@@ -1,8 +1,8 @@
-"""Between colour frames and the mosaic that a sensor sees.
+"""Converting between colour frames and the mosaic that a sensor sees.
 
-A pixel of a colour frame is one 2 x 2 cell of the colour filter array: the frame has half the sensor's rows and
-columns, its green is the mean of the cell's two, and no noise is spread from pixel to pixel, as a demosaicking would.
-A mono sensor's pixels are the frame's.
+A pixel of a colour frame is one 2 x 2 cell of the colour filter array. The frame has half the sensor's rows and
+columns, its green is the mean of the cell's two, and noise does not spread from pixel to pixel as in demosaicking.
+A mono sensor's pixels are those of the frame.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from hsnoise.model import NoiseModel
 
 
 def mosaic(light: ArrayLike, cfa: str) -> jax.Array:
-    """What falls on each sensor pixel, [..., 2 row, 2 column], of colour frames [..., row, column, 3].
+    """The light on each sensor pixel, [..., 2 row, 2 column], from colour frames [..., row, column, 3].
 
-    Of a mono sensor [..., row, column] of frames [..., row, column, 1].
+    For a mono sensor [..., row, column], from frames [..., row, column, 1].
 
     Raises:
-        ValueError: for another number of channels, or a `cfa` that is none.
+        ValueError: wrong number of channels, or an unknown `cfa`.
     """
     light, tile = jnp.asarray(light), cfa_tile(cfa)
     channels = int(tile.max()) + 1
@@ -34,16 +34,16 @@ def mosaic(light: ArrayLike, cfa: str) -> jax.Array:
 
 
 def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scalar | None = None) -> jax.Array:
-    """Colour frames of electrons, e- [..., row / 2, column / 2, 3], of counts [..., row, column] of a camera.
+    """Colour frames in electrons, e- [..., row / 2, column / 2, 3], from a camera's counts [..., row, column].
 
-    Black level (less what a black clamp subtracts) and mean dark current are taken off: without noise and clipping,
-    these are the photoelectrons of a sensor pixel. Of a mono sensor [..., row, column, 1].
+    Black level (net of a black clamp) and mean dark current are subtracted: without noise and clipping, the results are
+    the photoelectrons of each sensor pixel. For a mono sensor [..., row, column, 1].
 
     Args:
-        counts: DN; params: the camera; exposure_s: exposure, s, that of `params` by default.
+        counts: DN; params: the camera; exposure_s: exposure, s; default: that of `params`.
 
     Raises:
-        ValueError: for odd sizes with a Bayer array.
+        ValueError: odd sizes with a Bayer array.
     """
     counts, tile = jnp.asarray(counts), cfa_tile(params.cfa)
     period = len(tile)
@@ -53,7 +53,7 @@ def electrons_of(counts: ArrayLike, params: NoiseModel, exposure_s: float | Scal
     channels = len(params.channels)
 
     def of(effect: str, field: str, default: float = 0.0) -> jax.Array:
-        # A fit's parameters are float64, which a session in float32 would warn of.
+        # A fit's parameters are float64, which a float32 session would warn about.
         value = getattr(params[effect], field) if effect in params else jnp.full(channels, default)
         return jnp.broadcast_to(jax.lax.convert_element_type(value, jnp.float32), (channels,))
 

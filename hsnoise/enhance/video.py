@@ -1,4 +1,4 @@
-"""Colour video in and out: files through PyAV, folders of images, NumPy arrays. Display values, 8 bits."""
+"""Reading and writing colour video: files by PyAV, folders of images, NumPy arrays. Display values, 8 bits."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from hsnoise._core.interrupting import unfinished
 from hsnoise.frames.lazy import in_order
 
 VIDEO = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-WRITTEN = tuple(suffix for suffix in VIDEO if suffix != ".webm")  # those that hold H.264
+WRITTEN = tuple(suffix for suffix in VIDEO if suffix != ".webm")  # formats that hold H.264
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-# Of x264. crf: hard to tell from the original. mbtree: with it the same frames give another file each time.
+# Options of x264. crf: visually lossless. mbtree: would make the file differ each time.
 OPTIONS = {"crf": "16", "mbtree": "0"}
 BT709 = 1  # matrix, primaries and curve of HD video, in ITU-T H.273
 BITS_PER_SAMPLE = 258  # tag of TIFF
-LIMITED = 1  # range of 16 to 235, as FFmpeg numbers it
-WHOLE, SLACK_S = 0.95, 0.2  # of the length that a file announces: less is a loss, not a longer sound track
+LIMITED = 1  # FFmpeg's number for the range 16 to 235
+WHOLE, SLACK_S = 0.95, 0.2  # of the length that a file announces: less means lost frames, not a longer sound track
 
 
 def is_clip(path: Path) -> bool:
-    """Whether `frames_of` might read this path. Hidden files are no clips: macOS puts some beside every other."""
+    """Whether `frames_of` might read this path. Hidden files are excluded: macOS adds one beside every file."""
     if path.is_dir():
         return any(map(_is_image, path.iterdir()))
     return not path.name.startswith(".") and path.suffix.lower() in (*VIDEO, ".npz", ".npy")
@@ -42,9 +42,9 @@ def _is_image(path: Path) -> bool:
 def frames_of(path: str | os.PathLike) -> Iterator[np.ndarray]:
     """Frames [row, column, 3] of uint8, display values in R, G, B, upright, one after the other.
 
-    Warns after the last frame of a video file that is cut off or damaged.
+    Warns after the last frame if a video file is truncated or damaged.
 
-    path: a video file, a folder of images (in the order of their names, numbers by their size; every page of a TIFF
+    path: a video file, a folder of images (sorted by name, with numbers compared as numbers; every page of a TIFF
         is a frame), or an .npz (array `frames`) or .npy file.
 
     Raises:
@@ -76,7 +76,7 @@ def frames_of(path: str | os.PathLike) -> Iterator[np.ndarray]:
 
 
 def frame_rate_of(path: str | os.PathLike, default: float = 25) -> Fraction:
-    """Frames a second of a video file; `default` of what says none. Raises ValueError for what cannot be read."""
+    """Frames per second of a video file; `default` if it states none. Raises ValueError if it cannot be read."""
     path = Path(path)
     if path.suffix.lower() in VIDEO:
         with _opened(path) as container:
@@ -87,9 +87,9 @@ def frame_rate_of(path: str | os.PathLike, default: float = 25) -> Fraction:
 
 
 def write_video(path: str | os.PathLike, frames: Iterable[np.ndarray], rate: Fraction) -> int:
-    """Write frames [row, column, 3] of uint8 as H.264 in the colours of HD video, all or nothing; returns how many.
+    """Write frames [row, column, 3] of uint8 as H.264 in HD video colours, all or nothing; returns their number.
 
-    Odd sizes lose their last row or column, with a warning: the format has none. Raises ValueError for no frames or
+    Odd sizes lose their last row or column, with a warning: H.264 has even sizes. Raises ValueError for no frames or
     an unknown suffix, ImportError without PyAV.
     """
     path = Path(path)
@@ -172,23 +172,23 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
                 count += 1
                 yield np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
         announced_s = _length_s(container)
-        if damaged or end_s < WHOLE * announced_s - SLACK_S:  # else FFmpeg passes over what it cannot read
+        if damaged or end_s < WHOLE * announced_s - SLACK_S:  # FFmpeg skips what it cannot read without an error
             warnings.warn(
-                f"{path}: cut off or damaged; {count} frames could be read, up to {end_s:.3g} s, of a video of"
+                f"{path}: truncated or damaged; {count} frames could be read, up to {end_s:.3g} s, of a video of"
                 f" {announced_s:.3g} s",
                 stacklevel=2,
             )
 
 
 def _length_s(container: Any) -> float:
-    """Length of the video, s, that the file announces; 0 if it does not."""
+    """Length of the video, s, as the file announces it; 0 if it does not."""
     stream = container.streams.video[0]
     if stream.duration:
         return float(stream.duration * stream.time_base)
     if "DURATION" in stream.metadata:  # of Matroska
         hours, minutes, seconds = map(float, stream.metadata["DURATION"].split(":"))
         return 3600 * hours + 60 * minutes + seconds
-    return (container.duration or 0) / 1e6  # microseconds, of the longest stream
+    return (container.duration or 0) / 1e6  # microseconds; the longest stream's
 
 
 def _images(folder: Path) -> Iterator[np.ndarray]:
@@ -211,12 +211,12 @@ def _pages(path: Path, image: Any) -> Iterator[np.ndarray]:
         if "A" in page.getbands() or "transparency" in page.info:
             raise ValueError(f"{path}: expected an image without an alpha channel")
         yield np.asarray(ImageOps.exif_transpose(page).convert("RGB"))
-        if image.format == "MPO":  # of phones: the other pictures in it are maps of depth or of gain
+        if image.format == "MPO":  # from phones: its other pictures are depth or gain maps
             return
 
 
 def _is_deep(page: Any) -> bool:
-    """Whether the file holds more than 8 bits a channel, of which Pillow makes 8 if there are three channels."""
+    """Whether the file holds more than 8 bits a channel, which Pillow reduces to 8 for three channels."""
     in_tiff = getattr(page, "tag_v2", {}).get(BITS_PER_SAMPLE, (8,))
     in_png = any(str(tile.args).endswith(";16B") for tile in page.tile)
     return in_png or max(in_tiff) > 8 or page.mode.startswith(("I", "F"))
@@ -227,7 +227,7 @@ def _array(path: Path) -> np.ndarray:
         with open(path, "rb") as file:
             content = np.load(file)
             frames = content if isinstance(content, np.ndarray) else content["frames"]
-    except Exception as error:  # archives and headers fail in as many ways as they have bytes
+    except Exception as error:  # archives and headers can fail in countless ways
         raise ValueError(f"{path}: expected an array `frames` of video ({error})") from error
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
         raise ValueError(

@@ -1,6 +1,6 @@
-"""Networks and checkpoints on disk: one line of JSON that says what follows, then the arrays.
+"""Networks and checkpoints on disk: one line of JSON that describes the arrays, then the arrays.
 
-Files are written whole or not at all, and a hash tells one that was cut off or changed.
+Files are written whole or not at all, and a hash reveals truncated or changed ones.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hsnoise._core.output import write_atomically
 from hsnoise.stlstm import STLSTM
 
 FORMAT = "hsnoise arrays 2"
-SHIPPED = Path(__file__).parent / "data" / "enhancer_canon_5d3.eqx"  # what it is: the .txt beside it
+SHIPPED = Path(__file__).parent / "data" / "enhancer_canon_5d3.eqx"  # described by the .txt file beside it
 
 
 def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:
-    """Write the arrays of a PyTree, and what `about` (all that JSON can hold) says of them.
+    """Write the arrays of a PyTree and their description `about` (anything that JSON can hold).
 
     Raises:
         OSError: the folder does not exist or is full; an existing file is left as it was.
@@ -46,10 +46,10 @@ def _digest(content: bytes) -> str:
 
 
 def read_arrays(path: str | os.PathLike, like: Any) -> tuple[Any, dict[str, Any]]:
-    """The PyTree that `write_arrays` wrote, of the structure and shapes of `like`, and what it says of itself.
+    """The PyTree that `write_arrays` wrote, with the structure and shapes of `like`, and its description.
 
     Raises:
-        ValueError: for a file that is none, was cut off or changed, or holds arrays of other shapes.
+        ValueError: another kind of file, a truncated or changed one, or arrays of other shapes.
     """
     about, content = _read(path)
     return _restored(path, content, like), about
@@ -73,7 +73,7 @@ def _read(path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
     if not known:
         raise ValueError(f"{path}: not a file of weights or a checkpoint of hsnoise")
     if not whole:
-        raise ValueError(f"{path}: cut off or changed since it was written")
+        raise ValueError(f"{path}: truncated, or changed since it was written")
     return about, content
 
 
@@ -82,19 +82,19 @@ def _first_line(error: Exception) -> str:
 
 
 def save_network(path: str | os.PathLike, net: STLSTM, about: Mapping[str, Any]) -> None:
-    """Write a network with its sizes; `about` says what it was trained for. Raises OSError as `write_arrays`."""
+    """Write a network with its sizes; `about` describes its training. Raises OSError as `write_arrays`."""
     write_arrays(path, net, {**about, "network": sizes_of(net)})
 
 
 def load_network(path: str | os.PathLike) -> tuple[STLSTM, dict[str, Any]]:
-    """The network in a file of `save_network`, and what it was trained for.
+    """The network in a file of `save_network`, and the description of its training.
 
     Raises:
-        ValueError: for a file that holds no network, or one that is not finite, or was cut off or changed.
+        ValueError: a file without a network, with one that is not finite, or a truncated or changed file.
     """
     about, content = _read(path)
     if "network" not in about:
-        raise ValueError(f"{path}: holds no network; of a training run give weights.eqx, not a checkpoint")
+        raise ValueError(f"{path}: holds no network; give the weights.eqx of a training run, not a checkpoint")
     try:
         like = eqx.filter_eval_shape(STLSTM, jax.random.key(0), **about["network"])
     except (TypeError, ValueError, OverflowError) as error:
@@ -106,5 +106,5 @@ def load_network(path: str | os.PathLike) -> tuple[STLSTM, dict[str, Any]]:
 
 
 def sizes_of(net: STLSTM) -> dict[str, Any]:
-    """The arguments that make a network of these sizes."""
+    """The arguments that build a network of these sizes."""
     return {"maps": net.maps, "kernels": list(net.kernels), "stride": net.stride, "channels": net.channels}

@@ -6,9 +6,9 @@ import numpy as np
 
 from hsnoise._core.types import StatedGain
 from hsnoise.fitting.result import FitResult
+from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.flat_gain import LINE_RANGE, FlatGain, variance_curve
 from hsnoise.likelihood.flats import FlatMoments
-from hsnoise.likelihood.physics import flat_gain_of
 
 FALLING_BLACK = 0.005  # of the signal, by which the overscan differs from darks
 BLACK_SIGMAS = 5.0
@@ -20,7 +20,7 @@ def flat_notes(result: FitResult) -> list[str]:
     flats = result.summary.flats
     if flats is None:
         return []
-    return gain_notes(flat_gain_of(result.physics, flats), flats, result.summary.channels)
+    return gain_notes(flat_gain_of(result.params, flats), flats, result.summary.channels)
 
 
 def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -> list[str]:

@@ -11,9 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise.fitting.line_spectrum import band_means, spectrum_exponent
-from hsnoise.likelihood.physics import Physics
+from hsnoise.likelihood.moments import model_of
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import RowHistograms, Summary
 from hsnoise.lut import clipped_moments, row_moments, unclip
+from hsnoise.model import NoiseModel
 
 ROUNDS, TOLERANCE = 60, 1e-5  # of gain -> correction -> line -> gain
 LEAST_GAIN, MOST_GAIN = 0.02, 2.0  # of the gain that would make all variance shot noise
@@ -27,13 +29,13 @@ class LineFit:
     """Parameters of the paper's model by its own procedure.
 
     Attributes:
-        physics: values, finite also where nothing determines them.
-        standard_errors: of the same structure; infinite where undeterminable, 0 for what was given.
+        params: values, finite also where nothing determines them.
+        standard_errors: by the names of `params.table`; infinite where undeterminable, 0 for what was given.
         notes: sentences on what the numbers cannot say by themselves.
     """
 
-    physics: Physics
-    standard_errors: Physics
+    params: NoiseModel
+    standard_errors: dict[str, float]
     notes: tuple[str, ...]
 
 
@@ -341,26 +343,26 @@ def _result(estimate: _Estimate, correction: _Correction, setting: _Setting, sca
     has_gain = setting.is_line & (value.gain > 1.01 * LEAST_GAIN * most)
     has_rate = has_gain.any() & summary.exposure_s.any()
     has_black = summary.black_level_dn is not None or np.ptp(summary.exposure_s) > 0
-    infinite = np.full_like(value.black_level, np.inf)
-    black_error = np.zeros_like(infinite) if summary.black_level_dn is not None else error.black_level
-    physics = Physics(
+    params = model_of(
+        summary,
         gain=value.gain,
         dark_current=np.maximum(value.dark_current, 0.0),
         read_noise=np.sqrt(np.maximum(value.read_variance, 0.0)),
-        row_sigma=np.sqrt(np.clip(value.row_variance, 0.0, MOST_ROW_VARIANCE)),
-        exponent=value.exponent,
+        row_gain=(np.sqrt(np.clip(value.row_variance, 0.0, MOST_ROW_VARIANCE)), value.exponent),
         black_level=np.array(value.black_level),
     )
-    errors = Physics(
-        gain=np.where(has_gain, error.gain, np.inf),
-        dark_current=np.where(has_rate & has_black, error.dark_current, np.inf),
-        read_noise=np.where(has_gain.any(), _root_error(value.read_variance, error.read_variance), np.inf),
-        row_sigma=np.where(has_black, _root_error(value.row_variance, error.row_variance), np.inf),
-        exponent=error.exponent,
-        black_level=black_error if has_black else infinite,
-    )
+    black_error = np.zeros(len(value.black_level)) if summary.black_level_dn is not None else error.black_level
+    known = {
+        ("gain", "value"): (has_gain, error.gain),
+        ("dark_current", "rate"): (has_rate & has_black, error.dark_current),
+        ("read_noise", "sigma"): (has_gain.any(), _root_error(value.read_variance, error.read_variance)),
+        ("row_gain", "sigma"): (has_black, _root_error(value.row_variance, error.row_variance)),
+        ("row_gain", "exponent"): (True, error.exponent),
+        ("black_level", "value"): (has_black, black_error),
+    }
+    errors = {n.name: float(np.where(*known[n.place], np.inf)[n.index]) for n in numbers_of(params) if n.place in known}
     notes = _notes(value, setting, correction, has_gain, has_black, len(scale) > 1, step)
-    return LineFit(physics, errors, notes)
+    return LineFit(params, errors, notes)
 
 
 def _root_error(variance, error):

@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.compiling import jit_lean
 from hsnoise._core.memory import give_back_free_memory
+from hsnoise.fitting.gradients import gradient_at, likelihood_at, parameters_at, prior_at, rules_at
 from hsnoise.likelihood.coordinates import Coordinates
-from hsnoise.likelihood.physics import Physics, Rules, evaluate
+from hsnoise.likelihood.darks import Rules
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules, replan
 from hsnoise.likelihood.summary import Summary, every_nth_row, some_frames, without_counts
+from hsnoise.model import NoiseModel
 
 ROUNDS = 16
 STEPS = 60
@@ -37,10 +38,12 @@ OFF_BOUND, WORTH_NATS = 0.0, 0.5  # softplus coordinate: 0.7 of what the data re
 class Maximum(NamedTuple):
     """Where a fit ended: parameters, information in them (inverse covariance), and how it went.
 
-    `vector` is the same in coordinates, and `whiten` a square root of their covariance.
+    `values` are those of the free numbers in `model` and `outliers`, `vector` the same in coordinates, and `whiten` a
+    square root of their covariance.
     """
 
-    physics: Physics
+    model: NoiseModel
+    outliers: np.ndarray | None
     values: np.ndarray
     information: np.ndarray
     log_likelihood: float
@@ -70,7 +73,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     scale = sum(summary.n_frames) / sum(few.n_frames)
     vector, whiten, iterations = pilot.vector, pilot.whiten / np.sqrt(thinning), pilot.iterations
     for turn in range(TURNS):
-        darks, flats = _pieces(_parameters(coordinates, vector)[0], summary, frames)
+        darks, flats = _pieces(coordinates, vector, summary, frames)
         # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.
         guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
         _, _, whiten = _curvature(coordinates, vector, whiten, guide)
@@ -85,7 +88,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
         vector = ahead  # too far for one curvature: another from here
 
     def anew(point):
-        parts = _pieces(_parameters(coordinates, point)[0], few, frames)
+        parts = _pieces(coordinates, point, few, frames)
         return _gradients_of_pieces(coordinates, [*parts[0], *parts[1]], 1 / scale, point[None])
 
     information = _in_parameters(coordinates, vector, whiten, anew) * scale
@@ -103,21 +106,21 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
     Once more where a parameter was left at its bound of zero without need.
     """
     light = _on_device(without_counts(summary))
-    vector = np.asarray(eqx.filter_jit(Coordinates.vector)(coordinates, coordinates.base))
-    rules = _on_device(plan_rules(coordinates.base, summary))
+    vector = np.asarray(eqx.filter_jit(Coordinates.start)(coordinates))
+    rules = _on_device(plan_rules(coordinates.base, summary, outliers=coordinates.outliers))
     iterations = 0
     for _ in range(TURNS):
         vector, value, whiten, rules, steps, distance = _rounds(coordinates, vector, summary, light, rules)
         iterations += steps
 
         def anew(point, rules=rules):
-            own = replan(rules, plan_rules(_parameters(coordinates, point)[0], summary))
+            own = replan(rules, rules_at(coordinates, point, summary))
             return _gradients(coordinates, light, _on_device(own), point[None])
 
         ahead = _off_bounds(coordinates, vector, value, anew)
         if (ahead == vector).all():
             break
-        vector, rules = ahead, _on_device(replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary)))
+        vector, rules = ahead, _on_device(replan(rules, rules_at(coordinates, ahead, summary)))
     information = _in_parameters(coordinates, vector, whiten, anew)
     return _ended(coordinates, vector, whiten, information, float(value), iterations, distance)
 
@@ -134,7 +137,7 @@ def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, 
         if not np.isfinite(ahead).all():
             distance = np.inf
             break
-        rules = _on_device(replan(rules, plan_rules(_parameters(coordinates, ahead)[0], summary)))
+        rules = _on_device(replan(rules, rules_at(coordinates, ahead, summary)))
         value, gradient, whiten = _curvature(coordinates, ahead, whiten, partial(_gradients, coordinates, light, rules))
         # Length in standard errors of the Newton step that is left.
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
@@ -163,7 +166,7 @@ def _on_device(tree):
     return jax.tree.map(jnp.asarray, tree)  # once, not with every gradient
 
 
-def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
+def _pieces(coordinates: Coordinates, vector, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
     """The likelihood in pieces that add up, those of darks and of flats: (summary, rules) for each.
 
     A piece of the darks is `frames` frames of one channel, all of one shape, so that memory and compilation are
@@ -172,7 +175,8 @@ def _pieces(physics: Physics, summary: Summary, frames: int) -> tuple[list[tuple
     channels = range(len(summary.channels))
     light = without_counts(replace(summary, flats=None))
     parts = (some_frames(summary, start, start + frames) for start in range(0, max(summary.n_frames), frames))
-    rules = [[plan_rules(physics, part, CLOSE_MARGIN, channel=c) for c in channels] for part in parts]
+    plan = partial(rules_at, coordinates, vector, margin=CLOSE_MARGIN)
+    rules = [[plan(part, channel=c) for c in channels] for part in parts]
     # Channels of one stride share a program, too.
     strides = [h.row_stride for h in summary.histograms]
     most = {
@@ -189,7 +193,7 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
     """Values and gradients at `points`, summed over the pieces."""
     values, gradients = [], []
     for point in jnp.asarray(points):
-        value, gradient = (np.asarray(x) for x in _prior_at(coordinates, point))
+        value, gradient = (np.asarray(x) for x in prior_at(coordinates, point))
         for light, rules in pieces:
             weight = 1.0 if light.histograms else flats_weight
             of_piece, slope = likelihood_at(coordinates, point, light, rules)
@@ -216,11 +220,6 @@ def _chords(vector, whiten, gradients):
             return *best, steps
         steps += 1
         ahead = best[0] + length * step
-
-
-@eqx.filter_jit
-def _prior_at(coordinates, vector):
-    return jax.value_and_grad(coordinates.log_prior)(vector)
 
 
 def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
@@ -264,35 +263,11 @@ def _step(solver, y, told, state):
     return y, state, done
 
 
-def gradient_at(coordinates, vector, summary, rules):
-    """Log-likelihood plus prior, and its gradient.
-
-    Each rule has a program of its own: compiling one for all takes 200 MiB more.
-    """
-    dark = replace(summary, flats=None)
-    parts = [_prior_at(coordinates, vector), *(likelihood_at(coordinates, vector, dark, (rule,)) for rule in rules)]
-    if summary.flats is not None:
-        parts.append(likelihood_at(coordinates, vector, replace(summary, histograms=()), ()))
-    return tuple(map(sum, zip(*parts, strict=True)))
-
-
-@jit_lean
-def likelihood_at(coordinates, vector, summary, rules):
-    """Log-likelihood and its gradient."""
-    return jax.value_and_grad(lambda at: evaluate(coordinates.physics(at), summary, rules))(vector)
-
-
 def _gradients(coordinates, summary, rules, points):
     """Values and gradients at `points`, one after the other."""
     found = [gradient_at(coordinates, point, summary, rules) for point in jnp.asarray(points)]
     values, gradients = zip(*found, strict=True)
     return np.asarray(values), np.asarray(gradients)
-
-
-@eqx.filter_jit
-def _parameters(coordinates, vector):
-    physics = coordinates.physics(vector)
-    return physics, coordinates.flat(physics), coordinates.slope(vector), coordinates.log_prior(vector)
 
 
 def _curvature(coordinates, vector, whiten, gradients_at):
@@ -344,7 +319,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     nothing changes; its row is measured between two values off the bound within what the data resolve. `gradient_anew`
     plans the rules for a point: the nodes for rows without gain all lie at 1.
     """
-    slope = np.asarray(_parameters(coordinates, vector)[2])
+    slope = np.asarray(parameters_at(coordinates, vector)[2])
     active = ~_idle(coordinates, vector)
     inverse = np.linalg.inv(slope[active, None] * whiten[np.ix_(active, active)])
     information = np.zeros((len(vector), len(vector)))
@@ -353,7 +328,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     for i in at_bound:
         ends = [coordinates.put_inside(vector, i, depth) for depth in (0.0, 1.5)]
         gradients = [gradient_anew(end)[1][0] for end in ends]
-        at_ends = (_parameters(coordinates, jnp.asarray(e)) for e in ends)
+        at_ends = (parameters_at(coordinates, jnp.asarray(e)) for e in ends)
         values, slopes = zip(*(map(np.asarray, at_end[1:3]) for at_end in at_ends), strict=True)
         low, high = (np.asarray(g) / s for g, s in zip(gradients, slopes, strict=True))
         row = -(high - low) / (values[1][i] - values[0][i])
@@ -378,9 +353,10 @@ def _is_positive(matrix: np.ndarray, places: list[int]) -> bool:
 
 
 def _ended(coordinates, vector, whiten, information, value, iterations, distance, close_sigma=CLOSE_SIGMA) -> Maximum:
-    physics, values, _, log_prior = jax.tree.map(np.asarray, _parameters(coordinates, vector))
+    (model, outliers), values, _, log_prior = jax.tree.map(np.asarray, parameters_at(coordinates, vector))
     return Maximum(
-        physics=physics,
+        model=model,
+        outliers=outliers,
         values=values,
         information=information,
         log_likelihood=value - float(log_prior),

@@ -7,9 +7,12 @@ from itertools import chain
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.fitting.flat_notes import flat_notes
 from hsnoise.fitting.profile import WEAK
 from hsnoise.fitting.result import FitResult
+from hsnoise.likelihood.darks import black_level
+from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import RowHistograms
 
 UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
@@ -36,7 +39,8 @@ def pixel_notes(result: FitResult) -> tuple[str, ...]:
 
 def parameter_notes(result: FitResult) -> list[str]:
     """What the capture does not determine of the paper's effects."""
-    return [note for name, row in result.table.items() if (note := _note(name, row, result))]
+    table, numbers = result.table, numbers_of(result.params)
+    return [note for number in numbers if (note := _note(number, table[number.name], result))]
 
 
 def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
@@ -44,36 +48,48 @@ def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
     return f"{name} is compatible with zero (below {f'{value + 2 * error:.2g} {unit}'.rstrip()})"
 
 
-def _note(name: str, row: tuple[float, float, str], result: FitResult) -> str | None:
+def _note(number: Number, row: tuple[float, float, str], result: FitResult) -> str | None:
     value, error, unit = row
     if np.isnan(value):  # withheld: the doubts say so
         return None
-    parameter = name.removesuffix(name[name.rfind(".") :]) if name[-2:] in (".R", ".G", ".B") else name
-    relative = error / max(abs(value), 1e-30)
-    if parameter == "gain" and relative > UNDETERMINED:
-        known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
-        return f"{name} is not determined{known}: add flats, or darks of longer exposures."
-    if parameter == "gain" and relative > WEAK:
-        return f"{name} is known to {relative:.0%} only, with read noise and dark current: add flats, or longer darks."
-    if parameter == "read_noise.sigma" and relative > UNDETERMINED:
-        in_dn = value * float(np.mean(result.physics.gain))
-        return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
-    if parameter == "dark_current.rate":
-        return _dark_current_note(value, error, result)
-    # It is a variance that is estimated: its own error is 2 value x error.
-    if parameter == "row_gain.sigma" and np.isinf(error):
-        return f"{name} is not determined: add darks of longer exposures, or flats."
-    if parameter == "row_gain.sigma" and value < 4 * error:
-        return f"{near_zero(name, value, error)}."
-    if parameter == "row_gain.exponent" and name in result.names and error > 0.4:
-        return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
-    if parameter == "row_gain.white_share" and name in result.names and error > 0.1:
-        return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
-    has_bias = len(result.summary.exposure_s) > 0 and result.summary.exposure_s.min() == 0
-    if parameter == "black_level" and name in result.names and error > 1.0 and not has_bias:
-        known = "" if np.isinf(error) else f" ({error:.2g} DN)"
-        return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."
+    name, relative = number.name, error / max(abs(value), 1e-30)
+    match number.place:
+        case "gain", _ if relative > UNDETERMINED:
+            known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
+            return f"{name} is not determined{known}: add flats, or darks of longer exposures."
+        case "gain", _ if relative > WEAK:
+            known = f"{name} is known to {relative:.0%} only, with read noise and dark current"
+            return f"{known}: add flats, or longer darks."
+        case "read_noise", "sigma" if relative > UNDETERMINED:
+            in_dn = value * float(np.mean(result.params["gain"].value))
+            return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
+        case "dark_current", "rate":
+            return _dark_current_note(value, error, result)
+        case "row_gain", _:
+            return _row_gain_note(number, value, error, result)
+        case "black_level", _ if name in result.names and error > 1.0 and not _has_bias(result):
+            known = "" if np.isinf(error) else f" ({error:.2g} DN)"
+            return f"{name} is not determined{known}: add bias frames (0 s), or give black_level."
     return None
+
+
+def _row_gain_note(number: Number, value: float, error: float, result: FitResult) -> str | None:
+    name, fitted = number.name, number.name in result.names
+    # It is a variance that is estimated: its own error is 2 value x error.
+    if number.field == "sigma" and np.isinf(error):
+        return f"{name} is not determined: add darks of longer exposures, or flats."
+    if number.field == "sigma" and value < 4 * error:
+        return f"{near_zero(name, value, error)}."
+    if number.field == "exponent" and fitted and error > 0.4:
+        return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
+    if number.field == "white_share" and fitted and error > 0.1:
+        return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
+    return None
+
+
+def _has_bias(result: FitResult) -> bool:
+    """Whether there are darks of no exposure."""
+    return len(result.summary.exposure_s) > 0 and bool(result.summary.exposure_s.min() == 0)
 
 
 def _dark_current_note(value: float, error: float, result: FitResult) -> str | None:
@@ -106,7 +122,7 @@ def outlier_fraction(result: FitResult) -> np.ndarray:
 def _misfit_notes(result: FitResult) -> list[str]:
     """What the fitted histograms miss: outliers, and a shape that the model does not have."""
     notes = []
-    outside = result.physics.outliers
+    outside = result.outliers
     if outside is not None:
         e = int(outside.argmax())
         notes.append(
@@ -184,7 +200,7 @@ def _drifts(result: FitResult) -> list[float]:
     """Relative change of the dark signal over the frames of an exposure, along a straight line; 0 if within chance."""
     summary, drifts = result.summary, []
     least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # of a signal that may be called one
-    black = float(np.mean(np.asarray(result.physics.black_level)))
+    black = float(np.mean(black_level(result.params)))
     for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
         pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
         means = sum(h.row_sum[e, :frames].sum(1) for h in summary.histograms) / np.maximum(pixels, 1) - black
@@ -215,13 +231,13 @@ def _light_note(result: FitResult) -> list[str]:
     if _is_lit(result, levels):
         return [
             f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
-            f" {exposures.max():g} s: if they saw light, they are flats; pass kind='flat'."
+            f" {exposures.max():g} s: if they saw light, they are flats; pass {setting('kind', 'flat')}."
         ]
     if not rate >= LIGHT_E_PER_S:
         return []
     return [
         f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
-        " pass kind='flat'."
+        f" pass {setting('kind', 'flat')}."
     ]
 
 

@@ -7,31 +7,24 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.effects import (
-    ADC,
     AbstractEffect,
-    BlackLevel,
     BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
-    DarkCurrent,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     FrameOffset,
-    Gain,
     HotPixels,
-    ReadNoise,
     RowFixedPattern,
-    RowGain,
     RowNoise,
-    ShotNoise,
 )
 from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
-from hsnoise.fitting.result import FitResult
-from hsnoise.likelihood.physics import Physics
+from hsnoise.fitting.result import FitResult, Method, Status
+from hsnoise.likelihood.moments import model_of
+from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.shading import Shading
@@ -42,7 +35,7 @@ FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poi
 THERE = 5.0  # standard errors from which an effect of the population is in the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not tell it
 IN_OTHER_UNITS = {"dark_current_nonuniformity", "black_shading"}
-IN_ELECTRONS = ("gain", "dark_current.rate", "read_noise.sigma")
+IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
 OF_PIXELS = (
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
@@ -66,30 +59,31 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
     black, row = _black(pixel, summary), _rows(pixel)
+    paper = model_of(
+        summary,
+        gain=gain,
+        dark_current=max(rate, 0.0),
+        read_noise=read,
+        row_gain=(row[0], ROLLING_EXPONENT if summary.shutter == "rolling" else 0.0),
+        black_level=black[0],
+    )
     with jax.enable_x64(True):
-        physics = Physics(
-            gain=jnp.asarray(gain),
-            dark_current=jnp.asarray(max(rate, 0.0)),
-            read_noise=jnp.asarray(read),
-            row_sigma=jnp.asarray(row[0]) if "row_gain" in wanted else None,
-            exponent=jnp.asarray(ROLLING_EXPONENT if summary.shutter == "rolling" else 0.0),
-            black_level=jnp.asarray(black[0]),
-        )
-        params = _model(wanted, physics, population, summary, pixel)
-    names, covariance = _covariance(pixel, params, population, black[1], row)
-    withheld = () if pixel.determined else tuple(n for n in params.table if in_electrons(n))
+        params = _model(wanted, paper, population, pixel)
+    names, covariance = _covariance(pixel, params, population, black[1], row[1])
     errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
-    unknown = [name for name, error in errors.items() if name.startswith("row_gain.sigma") and error > 1]
+    numbers = numbers_of(params)
+    withheld = () if pixel.determined else tuple(number.name for number in numbers if in_electrons(number))
+    unknown = [n.name for n in numbers if n.place == ("row_gain", "sigma") and errors.get(n.name, 0.0) > 1]
     if np.ptp(summary.exposure_s) == 0 and "dark_current" in params:
         unknown.append("dark_current.rate")
     withheld = tuple(dict.fromkeys((*withheld, *unknown)))
     return FitResult(
         params=params,
-        physics=jax.tree.map(np.asarray, physics),
         names=names,
         covariance=covariance,
-        method="transfer",
-        outcome=_outcome(pixel),
+        method=Method.TRANSFER,
+        status=Status.TRANSFER,
+        detail=_detail(pixel),
         iterations=0,
         log_likelihood=float("nan"),
         notes=(),
@@ -101,13 +95,12 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     )
 
 
-def in_electrons(name: str) -> bool:
+def in_electrons(number: Number) -> bool:
     """Whether a parameter has no value without the gain."""
-    effect = name.split(".")[0]
-    return name.startswith(IN_ELECTRONS) or effect in set(POPULATION) - IN_OTHER_UNITS
+    return number.place in IN_ELECTRONS or number.effect in set(POPULATION) - IN_OTHER_UNITS
 
 
-def _outcome(pixel: PixelFit) -> str:
+def _detail(pixel: PixelFit) -> str:
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
     if pixel.flats is not None and pixel.determined:
         return "gain from the flats, read noise from each pixel over time"
@@ -223,17 +216,9 @@ def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
     return np.array(sigma), np.array(error)
 
 
-def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Summary, pixel: PixelFit) -> NoiseModel:
-    made = {
-        "shot_noise": ShotNoise,
-        "dark_current": lambda: DarkCurrent(physics.dark_current),
-        "read_noise": lambda: ReadNoise(physics.read_noise),
-        "row_gain": lambda: RowGain(physics.row_sigma, physics.exponent),
-        "gain": lambda: Gain(physics.gain),
-        "black_level": lambda: BlackLevel(physics.black_level),
-        "adc": lambda: ADC(summary.white_level_dn),
-    }
-    effects: list[AbstractEffect] = [made[name]() for name in wanted if name in made]
+def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: PixelFit) -> NoiseModel:
+    """The effects that are wanted, of the paper's model and of the population."""
+    effects: list[AbstractEffect] = [paper[name] for name in wanted if name in paper]
     classes: dict[str, Any] = {cls.name: cls for cls in OF_PIXELS}
     for name in wanted:
         if name in classes:
@@ -243,8 +228,7 @@ def _model(wanted: list[str], physics: Physics, population: Mapping, summary: Su
             drift = _shading(pixel) if name == "black_shading" else None
             chosen = {} if drift is None else {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
             effects.append(classes[name](**fields, **chosen))
-    t = np.sort(summary.exposure_s)
-    return NoiseModel(effects, cfa=summary.cfa, shutter=summary.shutter, exposure_s=float(t[len(t) // 2]))
+    return NoiseModel(effects, cfa=paper.cfa, shutter=paper.shutter, exposure_s=paper.exposure_s)
 
 
 def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:
@@ -261,23 +245,18 @@ def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:
 
 
 def _covariance(
-    pixel: PixelFit, params: NoiseModel, population, black_error, row
+    pixel: PixelFit, params: NoiseModel, population, black_error: np.ndarray, row_error: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray]:
     """Names that were fitted and their covariance: gain, read noise, dark current together, others by themselves."""
-    table, channels = params.table, params.channels
-    suffix = [""] if channels == ("mono",) else [f".{c}" for c in channels]
-    joint = [*(f"gain{s}" for s in suffix), "read_noise.sigma", "dark_current.rate"]
-    errors: dict[str, float] = {}
-    for c, s in enumerate(suffix):
-        errors[f"row_gain.sigma{s}"] = float(row[1][c])
-        if black_error[c] > 0:
-            errors[f"black_level{s}"] = float(black_error[c])
-    for effect, fields in population.items():
-        errors |= {f"{effect}.{field}": error for field, (_, error) in fields.items() if np.isfinite(error)}
-    names = [n for n in (*joint, *errors) if n in table]
-    covariance = np.diag([errors.get(n, 0.0) ** 2 for n in names])
-    places = [names.index(n) for n in joint if n in names]
-    kept = [i for i, n in enumerate(joint) if n in names]
+    numbers = numbers_of(params)
+    joint = [n.name for place in IN_ELECTRONS for n in numbers if n.place == place]
+    apart: dict[tuple[str, str], Any] = {("row_gain", "sigma"): row_error}
+    apart["black_level", "value"] = np.where(black_error > 0, black_error, np.inf)  # else it was given
+    apart |= {(effect, field): error for effect, fields in population.items() for field, (_, error) in fields.items()}
+    errors = {n.name: float(np.asarray(apart[n.place])[n.index]) for n in numbers if n.place in apart}
+    errors = {name: error for name, error in errors.items() if np.isfinite(error)}
+    covariance = np.diag([*np.zeros(len(joint)), *np.square(list(errors.values()))])
+    together = slice(len(joint))
     whole = pixel.covariance if pixel.determined else _without_gain(pixel, params)
-    covariance[np.ix_(places, places)] = whole[np.ix_(kept, kept)]
-    return tuple(names), covariance
+    covariance[together, together] = whole[together, together]
+    return (*joint, *errors), covariance

@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.fitting.maximise import Maximum, gradient_at, quasi_newton
+from hsnoise.fitting.gradients import gradient_at, rules_at
+from hsnoise.fitting.maximise import Maximum, quasi_newton
 from hsnoise.likelihood.coordinates import Coordinates
-from hsnoise.likelihood.plan import plan_rules, replan
+from hsnoise.likelihood.plan import replan
 from hsnoise.likelihood.summary import Summary, without_counts
 
 WEAK = 0.12  # standard error of the log gain from which the curvature is not trusted
@@ -22,15 +23,14 @@ def profile_errors(coordinates: Coordinates, maximum: Maximum, summary: Summary)
     The gain is moved up and down until the likelihood, maximised over all else, has fallen by that of about two
     standard errors; what a parameter moved by, over the number of standard errors fallen, is its error.
     """
-    gains = np.size(coordinates.base.gain)
-    pin = np.zeros(len(maximum.vector))
-    pin[:gains] = 1 / gains  # the gains come first
+    gains = coordinates.where("gain")
+    pin = gains / gains.sum()
     along = maximum.whiten.T @ pin
     sigma = float(np.linalg.norm(along))
     if sigma < WEAK or not maximum.converged:
         return np.zeros(len(pin))
     across = np.linalg.svd(along[None])[2][1:].T  # whitened directions that leave the gain where it is
-    rules = plan_rules(maximum.physics, summary)
+    rules = rules_at(coordinates, maximum.vector, summary)
     top, _ = gradient_at(coordinates, jnp.asarray(maximum.vector), without_counts(summary), rules)
     direction = maximum.whiten @ along / sigma
     sides = [_side(coordinates, maximum, summary, rules, float(top), sign * direction, across) for sign in (-1, 1)]
@@ -39,11 +39,11 @@ def profile_errors(coordinates: Coordinates, maximum: Maximum, summary: Summary)
 
 def _side(coordinates, maximum: Maximum, summary: Summary, rules, top: float, direction, across) -> np.ndarray:
     light = without_counts(summary)
-    shift, step = FIRST_SIGMA, np.abs(direction[0])
+    shift, step = FIRST_SIGMA, np.abs(direction[coordinates.where("gain").argmax()])
     for _ in range(STEPS):
         shift = min(shift, FARTHEST / step)
         vector = maximum.vector + shift * direction
-        rules = replan(rules, plan_rules(coordinates.physics(vector), summary))
+        rules = replan(rules, rules_at(coordinates, vector, summary))
         reach = coordinates.reach(vector)
         vector, _ = quasi_newton(coordinates, vector, maximum.whiten @ across, reach, top, light, rules)
         value, _ = gradient_at(coordinates, vector, light, rules)
@@ -51,5 +51,5 @@ def _side(coordinates, maximum: Maximum, summary: Summary, rules, top: float, di
         if z > ENOUGH_SIGMA or shift * step >= FARTHEST:
             break
         shift *= float(np.clip(2 / max(z, LEAST_Z), 1.2, 3.0))
-    moved = np.asarray(coordinates.flat(coordinates.physics(vector))) - maximum.values
+    moved = np.asarray(coordinates.values(vector)) - maximum.values
     return np.abs(moved) / max(z, LEAST_Z)

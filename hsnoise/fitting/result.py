@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
@@ -19,20 +20,55 @@ from hsnoise._core.data_frames import table_to_pandas
 from hsnoise._core.types import unit_in_words
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood import rows
-from hsnoise.likelihood.physics import Physics, binning, dark_laws, log_probability
+from hsnoise.likelihood.darks import binning, dark_laws, likelihood_part, log_probability, row_sigma
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary, without_counts
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
 
-TITLES = {
-    "ml": "Joint maximum likelihood",
-    "line": "Line fit",
-    "transfer": "Pixel transfer",
-    "synthetic": "Base fit, corrected for added effects by simulated statistics",
-}
 
-NOT_CONVERGED = "NOT CONVERGED: "
-AGREES = "Nothing in these frames contradicts these numbers. Compare tells whether frames drawn from them look alike."
+class Method(StrEnum):
+    """What a result was fitted by."""
+
+    ML = "ml"
+    LINE = "line"
+    TRANSFER = "transfer"
+    SYNTHETIC = "synthetic"
+
+
+class Status(StrEnum):
+    """How a fit ended."""
+
+    CONVERGED = "converged"
+    NOT_CONVERGED = "not converged"
+    LINE = "line fit"  # as asked
+    LINE_INSTEAD = "line fit instead"  # of a likelihood that did not converge
+    TRANSFER = "pixel transfer"
+    TRANSFER_INSTEAD = "pixel transfer instead"  # of a likelihood that did not converge
+    CONTRADICTED = "likelihood contradicted"  # by pixels over time: pixel transfer instead
+    MET = "statistics met"  # by simulated ones
+    NOT_MET = "statistics not met"
+
+
+TITLES = {
+    Method.ML: "Joint maximum likelihood",
+    Method.LINE: "Line fit",
+    Method.TRANSFER: "Pixel transfer",
+    Method.SYNTHETIC: "Base fit, corrected for added effects by simulated statistics",
+}
+OUTCOMES = {
+    Status.CONVERGED: "converged: {}",
+    Status.NOT_CONVERGED: "NOT CONVERGED: {}",
+    Status.LINE: "the paper's line fit, as asked",
+    Status.LINE_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); the line fit instead",
+    Status.TRANSFER: "{}",
+    Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer instead",
+    Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer instead",
+    Status.MET: "simulated statistics met: {}",
+    Status.NOT_MET: "NOT CONVERGED: simulated statistics not met: {}",
+}
+AGREES = "Nothing in these frames contradicts these numbers."
+LOOK_ALIKE = "Compare tells whether frames drawn from them look alike."
 
 
 @dataclass(frozen=True)
@@ -43,11 +79,12 @@ class FitResult:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         names, covariance: fitted parameters and their covariance, in the units of `table`.
         method: "ml", "line", "transfer" where pixels differ, or "synthetic" with effects beyond the paper's.
-        outcome: how the fit ended, in words; iterations: quasi-Newton steps taken.
+        status: how the fit ended; detail: the numbers to it, in words (`outcome` is both in a sentence).
+        iterations: quasi-Newton steps taken.
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
         summary: the row histograms and photon transfer that were fitted.
-        physics: the same parameters as `hsnoise.physics` takes them.
+        outliers: fraction of the pixels of each dark exposure that was set apart, as it follows no model; or None.
         doubts: sentences on what disagrees, and on what is withheld; printed above the table.
         grave: whether one of them says that a parameter may be wrong; others tell what was set apart.
         withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
@@ -60,13 +97,14 @@ class FitResult:
     params: NoiseModel
     names: tuple[str, ...]
     covariance: np.ndarray
-    method: str
-    outcome: str
+    method: Method
+    status: Status
+    detail: str
     iterations: int
     log_likelihood: float
     notes: tuple[str, ...]
     summary: Summary
-    physics: Physics
+    outliers: np.ndarray | None = None
     doubts: tuple[str, ...] = ()
     grave: bool = False
     withheld: tuple[str, ...] = ()
@@ -85,20 +123,25 @@ class FitResult:
         if not self.converged:
             return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
         if not self.doubts:
-            return Conclusion(Light.GREEN, AGREES)
+            return Conclusion(Light.GREEN, AGREES, LOOK_ALIKE)
         first = self.doubts[0]
         others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
         # That there is no gain is no error: noise in DN can be used.
         if not self.has_gain and not others:
-            return Conclusion(Light.AMBER, f"In DN only. {first}")
+            return Conclusion(Light.AMBER, "In DN only.", first)
         if self.grave:
-            return Conclusion(Light.RED, f"Do not use these numbers. {first}{others}")
-        return Conclusion(Light.AMBER, f"Usable, with doubts. {first}{others}")
+            return Conclusion(Light.RED, "Do not use these numbers.", f"{first}{others}")
+        return Conclusion(Light.AMBER, "Usable, with doubts.", f"{first}{others}")
+
+    @property
+    def further_doubts(self) -> tuple[str, ...]:
+        """The doubts that `conclusion` does not say."""
+        return self.doubts[1:] if self.converged else self.doubts
 
     @property
     def has_gain(self) -> bool:
         """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
-        return not any(name.split(".")[0] == "gain" for name in self.withheld)
+        return not any(number.name in self.withheld for number in numbers_of(self.params, ["gain"]))
 
     @cached_property
     def pixels(self) -> PixelMaps:
@@ -108,7 +151,7 @@ class FitResult:
         """
         if self.stack is None:
             raise ValueError("pixels: this fit has no frames, it was made from a Summary or from flats")
-        return pixel_maps(self.stack, np.asarray(self.physics.gain) if self.has_gain else None)
+        return pixel_maps(self.stack, np.asarray(self.params["gain"].value) if self.has_gain else None)
 
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
@@ -124,10 +167,20 @@ class FitResult:
             rows_[name] = (value, error, unit)
         return rows_
 
+    def rows_of(self, effect: str) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table` that are one effect's. Raises KeyError if the model has none of that name."""
+        table = self.table
+        return {one.name: table[one.name] for one in self.params[effect].parameters(self.params.channels)}
+
+    @property
+    def outcome(self) -> str:
+        """How the fit ended, in words."""
+        return OUTCOMES[self.status].format(self.detail)
+
     @property
     def converged(self) -> bool:
         """Whether the fit ended where it should."""
-        return not self.outcome.startswith(NOT_CONVERGED)
+        return self.status not in (Status.NOT_CONVERGED, Status.NOT_MET)
 
     def without(self, names: tuple[str, ...]) -> FitResult:
         """The same fit without some of the effects that it put in by itself; other numbers stay as they are."""
@@ -158,10 +211,9 @@ class FitResult:
     def expected_laws(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each channel [exposure, bin]: probability of a bin over all row gains, and its deviation between rows."""
         with jax.enable_x64(True):
-            physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self.physics)
-            light = without_counts(self.summary)
+            sensor, light = (likelihood_part(self.params), self.outliers), without_counts(self.summary)
             found = (
-                _expected(physics, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
+                _expected(sensor, c, light, h.edges_dn, h.outlier_law) for c, h in enumerate(self.summary.histograms)
             )
             return [jax.tree.map(np.asarray, laws) for laws in found]
 
@@ -202,10 +254,9 @@ class FitResult:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        conclusion = self.conclusion
         return _html.fragment(
-            _html.conclusion(conclusion),
-            _html.sentences(doubt for doubt in self.doubts if doubt not in conclusion.sentence),
+            _html.conclusion(self.conclusion),
+            _html.sentences(self.further_doubts),
             _html.paragraph(self._title),
             _html.printed(self._rounded_table()),
             _html.details(
@@ -217,24 +268,28 @@ class FitResult:
 
 
 @jax.jit
-def _expected(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
-    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin]."""
+def _expected(sensor, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
+    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin].
+
+    sensor: a model and the shares of outliers beside it.
+    """
+    model, outliers = sensor
     beta, weight = jnp.ones(1), jnp.ones(1)
-    if physics.row_sigma is not None:
-        sigma = jnp.maximum(physics.row_sigma[c], 1e-6)
+    if "row_gain" in model:
+        sigma = row_sigma(model)[c]
         nodes = rows.make_nodes(jnp.zeros(1), (1 + rows.PRIOR_REACH * sigma)[None], 0.1, sigma, 256)
         beta, density = nodes.beta[0], jax.scipy.stats.norm.pdf(nodes.beta[0], 1.0, sigma)
         weight = jnp.exp(nodes.log_weight[0]) * density
         weight = weight.at[0].add(jax.scipy.stats.norm.cdf((beta[0] - 1) / sigma))
 
     def exposure(at):
-        law = jnp.exp(log_probability(physics, at, beta))
+        law = jnp.exp(log_probability(model, outliers, at, beta))
         share = weight / weight.sum()
         mixed = share @ law
         return mixed / mixed.sum(), jnp.sqrt(share @ (law - mixed[None, :]) ** 2)
 
     exposures = len(summary.exposure_s)
-    laws = dark_laws(physics, summary.exposure_s)
+    laws = dark_laws(model, summary.exposure_s)
     at = binning(summary, laws, jnp.full(exposures, c), jnp.arange(exposures), edges_dn, outlier_law)
     return jax.lax.map(exposure, at)
 

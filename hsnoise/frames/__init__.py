@@ -1,4 +1,4 @@
-"""Captures: `FrameStack`, frames read one at a time, Bayer orders, checks of counts, the example that is shipped.
+"""Captures: `FrameStack`, frames read one at a time, Bayer orders, checks of counts, the shipped example.
 
 May import `_core`.
 """

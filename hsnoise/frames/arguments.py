@@ -1,4 +1,4 @@
-"""Arguments of a `FrameStack`, checked one by one; errors say what was expected and what came."""
+"""Arguments of a `FrameStack`, checked one by one; errors say what was expected and what was given."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.arguments import listed, not_negative, numbers, one_of, positive
+from hsnoise._core.naming import named, setting
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.lazy import LazyFrames
 
@@ -17,7 +18,7 @@ KINDS = ("dark", "flat")
 
 
 def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[float]) -> None:
-    """Raise ValueError if two frames are the same, told by what stands for each, `prints` [exposure, frame]."""
+    """Raise ValueError if two frames are identical, judged by their `prints` [exposure, frame]."""
     seen: dict[bytes, tuple[int, float]] = {}
     for of_exposure, seconds in zip(prints, exposure_s, strict=True):
         for number, one in enumerate(of_exposure):
@@ -29,13 +30,13 @@ def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[floa
                     else f"frame {first} of the {earlier:g} s exposure and frame {number} of the {seconds:g} s exposure"
                 )
                 raise ValueError(
-                    f"counts: {which} are identical; a copy tells nothing of the noise, so give each frame once"
+                    f"counts: {which} are identical; copies hold no information on noise, so give each frame once"
                 )
             seen[one] = number, seconds
 
 
 def exposure_groups(counts: Any) -> tuple[Any, ...]:
-    """Counts as one array-like `[frame, row, column]` an exposure, sizes not yet compared."""
+    """Counts as one array-like `[frame, row, column]` per exposure; their sizes are not compared yet."""
     if isinstance(counts, np.ma.MaskedArray) or (
         isinstance(counts, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in counts)
     ):
@@ -80,7 +81,7 @@ def _as_array(counts: Any) -> Any:
 
 
 def check_sizes(groups: tuple[Any, ...], cfa: str) -> None:
-    """Raise ValueError unless all frames have one size that fits the colour filter array, and are enough."""
+    """Raise ValueError unless there are enough frames, all of one size that fits the colour filter array."""
     sizes = {tuple(group.shape[1:]) for group in groups}
     if len(sizes) > 1:
         raise ValueError(f"counts: frames of all exposures must have one size, got {sorted(sizes)}")
@@ -90,13 +91,13 @@ def check_sizes(groups: tuple[Any, ...], cfa: str) -> None:
         raise ValueError(f"counts: got {numbers} frames of {rows} x {columns} pixels; none may be empty")
     if sum(numbers) == 1:
         raise ValueError(
-            "counts: a single frame does not tell noise from fixed pattern; give at least two frames, of the "
+            "counts: a single frame cannot separate noise from fixed pattern; give at least two frames, of the "
             "same exposure (better: eight or more) or of different exposures"
         )
     if cfa != "mono" and (rows % 2 or columns % 2):
         raise ValueError(
             f"counts: a Bayer sensor ({cfa}) needs even numbers of rows and columns, got {rows} x {columns}; "
-            "crop the frames (hsnoise.load: roi=)"
+            f"crop the frames (hsnoise.load: {setting('roi')})"
         )
 
 
@@ -105,7 +106,7 @@ def exposures(exposure_s: Any, n: int) -> np.ndarray:
     if exposure_s is None:
         raise ValueError(
             f"exposure_s is missing: give the exposure time in seconds of each of the {n} exposure(s), 0 for "
-            "bias frames; dark current per second cannot be told without it"
+            "bias frames; dark current per second is unknown without it"
         )
     return not_negative("exposure_s", numbers("exposure_s", exposure_s, n, "exposure"))
 
@@ -114,10 +115,10 @@ def kinds(kind: str | Sequence[str], n: int) -> tuple[str, ...]:
     """Kind of each exposure."""
     given = (kind,) * n if isinstance(kind, str) else listed("kind", kind, "'dark', 'flat' or a list of them")
     if len(given) != n:
-        raise ValueError(f"kind: expected one, or {n} (one an exposure), got {len(given)}: {given}")
+        raise ValueError(f"{named('kind')}: expected one, or {n} (one an exposure), got {len(given)}: {given}")
     for one in given:
         if one == "bias":
-            raise ValueError("kind: got 'bias', expected 'dark' or 'flat'; a bias frame is a dark of 0 s")
+            raise ValueError(f"{named('kind')}: got 'bias', expected 'dark' or 'flat'; a bias frame is a dark of 0 s")
         one_of("kind", one, KINDS)
     return given
 
@@ -169,7 +170,7 @@ def _known(name: str, value: Any, n: int) -> np.ndarray | None:
 
 
 def stated(stated_gain: Any) -> StatedGain | None:
-    """A header's gain. Raises TypeError for what is no `StatedGain`, ValueError unless it is finite and above 0."""
+    """A header's gain. Raises TypeError unless it is a `StatedGain`, ValueError unless finite and above 0."""
     if stated_gain is None:
         return None
     if not isinstance(stated_gain, StatedGain):
@@ -179,7 +180,7 @@ def stated(stated_gain: Any) -> StatedGain | None:
 
 
 def sentences(assumed: Any) -> tuple[str, ...]:
-    """What was assumed, a tuple of str. Raises TypeError for anything else."""
+    """`assumed` as a tuple of str. Raises TypeError for anything else."""
     given = listed("assumed", assumed, "a list of sentences")
     for one in given:
         if not isinstance(one, str):

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def channel_planes(cfa: str, channel: str) -> list[tuple[int, int]]:
-    """(row, column) offsets in the 2x2 cell of the pixels of a channel; mono has one plane."""
+    """(row, column) offsets of a channel's pixels in the 2x2 cell; mono has one plane."""
     if cfa == "mono":
         return [(0, 0)]
     return [divmod(i, 2) for i, letter in enumerate(cfa) if letter == channel]
@@ -20,7 +20,7 @@ def channel_pixels(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
 
 
 def transpose_cfa(cfa: str) -> str:
-    """Bayer order of the transposed frame."""
+    """Bayer order of a frame after transposing it."""
     return cfa if cfa == "mono" else cfa[0] + cfa[2] + cfa[1] + cfa[3]
 
 
@@ -32,7 +32,7 @@ def shift_cfa(cfa: str, rows: int, columns: int) -> str:
 
 
 def channel_rows(frame: np.ndarray, cfa: str, channel: str) -> np.ndarray:
-    """Pixels of a channel as [colour row, pixel]: R and B every second sensor row, G all of them."""
+    """Pixels of a channel as [colour row, pixel]: R and B are in every second sensor row, G in all."""
     if cfa == "mono":
         return frame
     planes = channel_planes(cfa, channel)

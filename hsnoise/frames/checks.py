@@ -51,14 +51,14 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
 
 
 def check_black_level(frames: Sequence[np.ndarray], black_level: Any, cfa: str) -> None:
-    """Check that black lies below the counts of some exposure.
+    """Check that black lies below the counts of at least one exposure.
 
-    A black level above the median of every exposure (by more than the noise: rounding and a camera that
-    subtracts its dark current may put the median a little below black) cannot be right.
+    A black level above the median of every exposure must be wrong. The margin is the noise, because rounding, or a
+    camera that subtracts its dark current, may put the median slightly below black.
 
     Args:
         frames: one frame `[row, column]` of each exposure, DN.
-        black_level: DN, None, one value or one a channel.
+        black_level: DN; None, one value or one per channel.
         cfa: "mono" or Bayer order of the frames' first pixel.
 
     Raises:

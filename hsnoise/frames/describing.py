@@ -1,4 +1,4 @@
-"""A `FrameStack` in words: what `print`, notebooks and the command line show of it."""
+"""Descriptions of a `FrameStack` for `print`, notebooks and the command line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Group = tuple[str, float, int, float, float, float]
 
 
 def groups_of(stack: Any) -> list[Group]:
-    """Of each exposure group of a `FrameStack` what COLUMNS say; NaN where it is unknown."""
+    """The values of COLUMNS for each exposure group of a `FrameStack`; NaN where unknown."""
     known = [stack.photons_e, stack.temperature_c, stack.overscan_dn]
     columns = [np.full(stack.n_exposures, np.nan) if values is None else values for values in known]
     numbers = np.stack(columns, 1).tolist()
@@ -25,8 +25,8 @@ def groups_of(stack: Any) -> list[Group]:
 
 
 def described(stack: Any) -> str:
-    """Size, levels and groups of a `FrameStack`, a line each, and what was assumed when it was loaded."""
-    lines = [f"FrameStack: {_size(stack)}", f"  {_levels(stack)}", *map(_line, groups_of(stack))]
+    """Size, levels and groups of a `FrameStack`, one per row, and what was assumed when it was loaded."""
+    lines = [f"FrameStack: {size_of(stack)}", f"  {levels_of(stack)}", *map(_line, groups_of(stack))]
     if stack.elsewhere is not None:
         lines.append(f"  {_elsewhere(stack)}")
         lines += [f"  {_line(group)}" for group in groups_of(stack.elsewhere)]
@@ -35,7 +35,7 @@ def described(stack: Any) -> str:
 
 def as_html(stack: Any) -> str:
     """The same for a notebook."""
-    pieces = [_html.paragraph(f"{_size(stack)}\n{_levels(stack)}"), _table(stack)]
+    pieces = [_html.paragraph(f"{size_of(stack)}\n{levels_of(stack)}"), _table(stack)]
     if stack.elsewhere is not None:
         pieces += [_html.paragraph(_elsewhere(stack)), _table(stack.elsewhere)]
     n = len(stack.assumed)
@@ -43,14 +43,16 @@ def as_html(stack: Any) -> str:
     return _html.fragment(*pieces, assumed)
 
 
-def _size(stack: Any) -> str:
+def size_of(stack: Any) -> str:
+    """Numbers of frames, rows and columns; colours, shutter and ISO."""
     rows, columns = stack.shape
     iso = "" if stack.iso is None else f", ISO {stack.iso:g}"
     n = sum(stack.n_frames)
     return f"{n} frames of {rows} rows x {columns} columns, {stack.cfa}, {stack.shutter} shutter{iso}"
 
 
-def _levels(stack: Any) -> str:
+def levels_of(stack: Any) -> str:
+    """Black and white level, and the gain that a header states."""
     black = "to be estimated" if stack.black_level is None else f"{np.round(stack.black_level, 3)} DN"
     white = "unknown" if stack.white_level is None else f"{stack.white_level:g} DN"
     stated = "" if stack.stated_gain is None else f", header {stack.stated_gain.source}"
@@ -70,7 +72,7 @@ def _line(group: Group) -> str:
 
 
 def _table(stack: Any) -> str:
-    """The groups as HTML, without columns of which nothing is known."""
+    """The groups as HTML, without columns that are unknown throughout."""
     groups = groups_of(stack)
     shown = [i for i in range(len(COLUMNS)) if i < 3 or any(np.isfinite(group[i]) for group in groups)]
     digits = ("", ".6g", "", "g", ".1f", ".1f")

@@ -10,16 +10,16 @@ from hsnoise._core.output import write_atomically
 
 
 def st8(folder: str | PathLike) -> Path:
-    """Write the example capture to a folder, as its owner would keep it: FITS files in dark3s/, dark25s/ and flat3s/.
+    """Write the example capture to a folder as an astronomer would keep it: FITS in dark3s/, dark25s/ and flat3s/.
 
-    It is of an SBIG ST-8, an astronomical CCD camera, at -10 degrees Celsius: 6 darks of 3 s, 7 darks of 25 s and 5
+    The camera is an SBIG ST-8, an astronomical CCD, at -10 degrees Celsius: 6 darks of 3 s, 7 darks of 25 s and 5
     flats of 3 s, 240 x 320 pixels from the middle of the sensor. Public domain (CC0); its README.txt names the source.
 
     Args:
-        folder: is made if it does not exist; files of the same names are replaced.
+        folder: created if it does not exist; files of the same names are replaced.
 
     Returns:
-        the folder, for `hsnoise.load`, `fit` and `inspect`.
+        the folder, to pass to `hsnoise.load`, `fit` or `inspect`.
 
     Raises:
         OSError: the folder cannot be written.

@@ -1,4 +1,4 @@
-"""Several stacks of one camera in one."""
+"""Joining several stacks of one camera."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hsnoise._core.types import StatedGain
 
 
 def replaced(stack: Any, **changes: Any) -> Any:
-    """A `FrameStack` with other arguments; `cfa` is that of the stored frames."""
+    """A copy of a `FrameStack` with some arguments changed; `cfa` is that of the stored frames."""
     return type(stack)(**{**stack._arguments(), **changes})
 
 
 def joined(stacks: Sequence[Any]) -> Any:
-    """What `FrameStack.join` returns, and raises."""
+    """The work of `FrameStack.join`."""
     if not stacks:
         raise ValueError("join: expected at least one FrameStack, got none")
     place = _place(next((stack for stack in stacks if "dark" in stack.kind), stacks[0]))
@@ -27,7 +27,7 @@ def joined(stacks: Sequence[Any]) -> Any:
 
 
 def _with_elsewhere(main: Any, apart: Sequence[Any]) -> Any:
-    """`main` with flats of another place; raises ValueError unless all are flats, of one place."""
+    """`main` with flats of another region; raises ValueError unless all are flats of one region."""
     if any("dark" in stack.kind or _place(stack) != _place(apart[0]) for stack in apart):
         sizes = " and ".join("{} x {}".format(*one.shape) for one in (main, *apart))
         raise ValueError(f"join: the stacks differ in shape or window ({sizes}); flats may, all in the same way")
@@ -40,7 +40,7 @@ def _with_elsewhere(main: Any, apart: Sequence[Any]) -> Any:
 
 
 def _place(stack: Any) -> tuple[Any, ...]:
-    """Where on the sensor the frames lie: stacks that agree have the same pixels."""
+    """The frames' region of the sensor: stacks for which it agrees have the same pixels."""
     return stack.shape, stack.window
 
 
@@ -52,7 +52,7 @@ def _check_same(one: Any, other: Any, names: Sequence[str]) -> None:
 
 
 def _in_one_place(stacks: Sequence[Any]) -> Any:
-    """The exposures of stacks of one place in one."""
+    """Stacks of one region joined."""
     first = stacks[0]
     for other in stacks[1:]:
         _check_same(first, other, ("row_axis", "cfa", "shutter", "black_level", "white_level", "iso"))
@@ -72,7 +72,7 @@ def _in_one_place(stacks: Sequence[Any]) -> Any:
 
 
 def _common_gain(stacks: Sequence[Any]) -> tuple[StatedGain | None, list[str]]:
-    """The gain that all headers state which state one, and what to say where they contradict each other."""
+    """The gain that the headers state, and a sentence if they contradict each other."""
     gains = list(dict.fromkeys(stack.stated_gain for stack in stacks if stack.stated_gain is not None))
     if len(gains) < 2:
         return (gains[0] if gains else None), []

@@ -1,4 +1,4 @@
-"""Frames that are read one at a time, in the order of their names, and crops of them."""
+"""Frames that are read one at a time, sorted by name, and crops of them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import numpy as np
 
 
 def in_order(path: Path) -> list[Any]:
-    """What frames are sorted by: their names, numbers in them by their size.
+    """The sort key of frames: their names, with the numbers in them compared as numbers.
 
-    dark2 comes before dark10, and dark_0.05s before dark_0.1s; of several points (1.2.10) each separates two numbers.
+    dark2 comes before dark10, and dark_0.05s before dark_0.1s; with several points (1.2.10) each separates two numbers.
     """
     parts = re.split(r"((?<![\d.])\d+\.\d+(?![\d.])|\d+)", path.stem)
     return [*(float(part) if i % 2 else part.lower() for i, part in enumerate(parts)), path.suffix.lower()]
 
 
 class LazyFrames:
-    """Frames that are read one at a time; stands in for an array `[frame, row, column]`.
+    """Frames that are read one at a time; used in place of an array `[frame, row, column]`.
 
-    An int index reads that frame; a slice gives the lazy stack of those frames, nothing is read.
+    An int index reads that frame. A slice gives a lazy stack of those frames and reads nothing.
 
     Args:
-        readers: one function a frame, each returns the frame `[row, column]`.
+        readers: one function per frame that returns the frame `[row, column]`.
         frame_shape: (rows, columns) that every frame must have.
         dtype: dtype of the stored counts.
-        names: what to call each frame in an error, such as its file.
+        names: how errors name each frame, such as by its file.
         taken: time of each exposure, ISO 8601; None where unknown.
     """
 
@@ -80,10 +80,10 @@ def _read_region(counts: Any, index: int, rows: slice, columns: slice) -> np.nda
 
 
 def read_mapped(counts: np.memmap, number: int) -> np.ndarray:
-    """A copy of one frame of a memory map, whose pages then no longer count as this process's memory."""
+    """A copy of one frame of a memory map; its pages then no longer count as this process's memory."""
     frame = np.array(counts[number])
     mapping = getattr(counts, "_mmap", None)
-    # Only of files opened to read: a private map would lose what was written to it.
+    # Only for maps opened for reading: a private map would lose what was written to it.
     if mapping is not None and counts.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
         mapping.madvise(mmap.MADV_DONTNEED)
     return frame

@@ -1,4 +1,4 @@
-"""One frame of a `FrameStack`: its name, its checks, its orientation, and what to say if it cannot be read."""
+"""Reading one frame of a `FrameStack`: its name, checks, orientation, and errors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from hsnoise.frames.lazy import LazyFrames
 def check_frame(frame: np.ndarray, stack: Any, *, exposure: int, frame_number: int) -> None:
     """Check the values of one raw frame `[row, column]` of a stack, DN.
 
-    `FrameStack.frame` and `frames` do so for every lazy frame they read, the constructor for every frame in
-    memory.
+    `FrameStack.frame` and `frames` check every lazy frame that they read, the constructor every frame in memory.
 
     Raises:
         ValueError: values that are not finite, not integers, negative, all the same, or mostly at the white
@@ -26,7 +25,7 @@ def check_frame(frame: np.ndarray, stack: Any, *, exposure: int, frame_number: i
 
 
 def frame_name(stack: Any, exposure: int, number: int) -> str:
-    """A frame as error messages call it: its file, or its place in the stack."""
+    """The name of a frame in error messages: its file, or its position in the stack."""
     counts = stack.counts[exposure]
     if isinstance(counts, LazyFrames):
         return counts.names[number]
@@ -41,18 +40,18 @@ def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:
 
 @contextmanager
 def while_reading(name: str) -> Iterator[None]:
-    """Raise RuntimeError if the cluster is lost that computes frames, the first of them called `name`.
+    """Raise RuntimeError if the cluster that computes the frames from `name` on is lost.
 
-    Other errors pass, those of whoever reads the chunks, say, with a note of where it was.
+    Other errors, such as those of a chunk's reader, pass with a note that names the frame.
     """
     try:
         yield
     except Exception as error:
-        if type(error).__module__.partition(".")[0] != "distributed":  # which is imported only by those who use it
-            error.add_note(f"while {name}, or a frame after it, was read")
+        if type(error).__module__.partition(".")[0] != "distributed":  # by name: it may not be installed
+            error.add_note(f"while reading {name} or a frame after it")
             raise
         raise RuntimeError(
-            f"{name}: the cluster was lost that this frame, or some after it, was read on ({type(error).__name__});"
+            f"{name}: lost the cluster that was reading this frame or some after it ({type(error).__name__});"
             " start it again, and run this once more"
         ) from error
 

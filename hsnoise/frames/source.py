@@ -1,4 +1,4 @@
-"""What the public functions take for a capture: a path, a stack, or bare arrays."""
+"""What public functions accept as a capture: a path, a stack, or bare arrays."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ OF_STACK = [name for name in inspect.signature(FrameStack).parameters if name !=
 
 
 def as_stack(source: Any, **keywords: Any) -> FrameStack:
-    """The capture that a public function was given.
+    """The argument of a public function as a `FrameStack`.
 
     Args:
-        source: a FrameStack, as it is; a path or a list of paths, for `load`; else counts, for `FrameStack`.
-        keywords: those of `load` (but for its progress), or those of `FrameStack`.
+        source: a FrameStack, returned as it is; a path or a list of paths, for `load`; else counts, for `FrameStack`.
+        keywords: those of `load` (except progress), or those of `FrameStack`.
 
     Raises:
-        TypeError: keywords beside a `FrameStack`, which holds them already, or that are not known; what is neither
+        TypeError: unknown keywords, or any beside a `FrameStack`, which holds them already; a source that is neither
             path, stack nor array, or paths and arrays in one list.
-        FileNotFoundError, ValueError: whatever `load` or `FrameStack` refuse.
+        FileNotFoundError, ValueError: errors of `load` or `FrameStack`.
     """
     is_path = _is_path(source)
     known = OF_LOAD if is_path else OF_STACK
@@ -42,7 +42,7 @@ def as_stack(source: Any, **keywords: Any) -> FrameStack:
 
 
 def _is_path(source: Any) -> bool:
-    """Whether it is a path, or a list of nothing but paths. Raises TypeError if only some are."""
+    """Whether it is a path or a list of paths. Raises TypeError if only some of a list are paths."""
     if not isinstance(source, list | tuple):
         return isinstance(source, str | PathLike)
     paths = [isinstance(one, str | PathLike) for one in source]

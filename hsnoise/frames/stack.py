@@ -1,4 +1,4 @@
-"""Captured raw frames with what is known about them, validated once: `FrameStack`."""
+"""`FrameStack`: captured raw frames and what is known about them, validated once."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from hsnoise.frames.joining import joined, replaced
 from hsnoise.frames.lazy import crop, read_mapped
 from hsnoise.frames.reading import check_frame, checked, frame_name, in_sensor_orientation, is_dask, while_reading
 
-BATCH = 64  # frames of a Dask array that are handed to its scheduler at a time
+BATCH = 64  # frames of a Dask array passed to its scheduler at a time
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -39,37 +39,37 @@ class FrameStack:
 
     Args:
         counts: DN; one array `[frame, row, column]` or `[exposure, frame, row, column]`, or a list of
-            `[frame, row, column]` arrays, one an exposure (frame numbers may differ). NumPy, JAX, or anything
+            `[frame, row, column]` arrays, one per exposure (frame numbers may differ). NumPy, JAX, or anything
             lazy with `.shape`, `.dtype` and an index along the first axis (memory map, Dask, HDF5 data set).
-            Arrays in memory are checked now, lazy ones frame by frame as they are read.
+            Arrays in memory are checked now, lazy arrays frame by frame as they are read.
         exposure_s: exposure time of each exposure group, s. A bias frame is a dark frame of 0 s.
-        black_level: DN, one value or one a channel; None: to be estimated.
+        black_level: DN, one value or one per channel; None: to be estimated.
         white_level: DN at which the sensor saturates; None: unknown.
         cfa: "mono" (or None), or the Bayer order from the first stored pixel on.
         shutter: "rolling" or "global".
-        kind: "dark" or "flat", one for all or one a group.
-        photons_e: expected photoelectrons per pixel, one a flat group (or one a group, NaN for darks); NaN or
+        kind: "dark" or "flat", one for all or one per group.
+        photons_e: expected photoelectrons per pixel, one per flat group (or one per group, NaN for darks); NaN or
             None: unknown.
-        temperature_c: sensor temperature, degrees Celsius, one for all or one a group (NaN: unknown).
+        temperature_c: sensor temperature, degrees Celsius, one for all or one per group (NaN: unknown).
         iso: ISO speed of all frames.
         row_axis: axis of a stored frame that counts sensor rows: 0, or 1 for frames stored in portrait.
-        window: (first row, first column, rows, columns) of the whole sensor where the frames are a part of it and
-            effects that depend on the place (glow, taps) are to be told in its coordinates; None: they are all of it.
+        window: (first row, first column, rows, columns): the first two are where the frames lie on the sensor, the
+            last two the sensor's size. Effects that depend on the place (glow, taps) need it if the frames are a crop.
+            None: the frames are the whole sensor.
         stated_gain: the gain that the files' headers state; None: they state none.
-        overscan_dn: DN, mean of the overscan pixels of each group, which `counts` lack (NaN or None: unknown).
-        elsewhere: flats of the same sensor at the same gain, of another crop or size: only what needs no positions,
-            their photon transfer, can be used. None: there are none.
+        overscan_dn: DN, mean of each group's overscan pixels, which are not in `counts` (NaN or None: unknown).
+        elsewhere: flats of the same sensor at the same gain, of another crop or size; only their photon transfer, which
+            needs no positions, can be used. None: there are none.
         assumed: sentences about what was assumed or set aside when the frames were loaded.
 
-    Attributes are the arguments, checked and brought to one shape: `counts` a tuple of arrays (as stored);
-    `exposure_s`, `photons_e`, `temperature_c` and `overscan_dn` arrays `[exposure]`, the last three None if nothing is
-    known;
-    `black_level` None, a float or an array `[channel]`; `kind` a tuple. `cfa` and `shape` are in sensor
-    orientation, that of `frames`.
+    Attributes are the checked arguments in one form: `counts` is a tuple of arrays (as stored); `exposure_s`,
+    `photons_e`, `temperature_c` and `overscan_dn` are arrays `[exposure]`, the last three None if nothing is known;
+    `black_level` is None, a float or an array `[channel]`; `kind` is a tuple. `cfa` and `shape` are in sensor
+    orientation, like `frames`.
 
     Raises:
         TypeError: counts are not numbers.
-        ValueError: any value or size that cannot be right; the message names the argument.
+        ValueError: an impossible value or size; the message names the argument.
     """
 
     counts: tuple[Any, ...]
@@ -161,7 +161,7 @@ class FrameStack:
         return channels_of(self.cfa)
 
     def is_lazy(self, exposure: int) -> bool:
-        """Whether this group's pixels are read only when asked for."""
+        """Whether this group's pixels are read only on demand."""
         counts = self.counts[exposure]
         return not isinstance(counts, np.ndarray) or isinstance(counts, np.memmap)
 
@@ -192,7 +192,7 @@ class FrameStack:
         combine: Callable[[Any, Any], Any] | None = None,
         chosen: Sequence[int] | None = None,
     ) -> Iterator[Any]:
-        """`function` of each frame of one exposure group, or of those `chosen`, in order.
+        """`function` of each frame of one exposure group, or of the `chosen` ones, in order.
 
         Frames of a Dask array are read, checked and reduced where its scheduler runs, such as on a cluster's workers;
         results come back, some as one if `combine` adds two up. Lost tasks run again; RuntimeError if all workers are.
@@ -201,7 +201,7 @@ class FrameStack:
         if not is_dask(counts):
             yield from (function(self.frame(exposure, number)) for number in chosen)
             return
-        import dask  # only for those who hand over a Dask array
+        import dask  # only needed for Dask arrays
 
         for start in range(0, len(chosen), BATCH):
             numbers = chosen[start : start + BATCH]
@@ -218,9 +218,9 @@ class FrameStack:
             yield from results
 
     def with_counts(self, counts: Sequence[np.ndarray], window: Window | None) -> FrameStack:
-        """Other `counts`, an array an exposure in sensor orientation, as if they had been taken as this stack was.
+        """A stack of other `counts`, one array per exposure in sensor orientation, taken under the same conditions.
 
-        Their values are not checked: what would be a broken file may be a fair draw of a quiet camera.
+        Their values are not checked: what would mean a broken file may be a valid draw of a quiet camera.
         """
         unknown = {"black_level": None, "photons_e": None, "temperature_c": None, "iso": None, "row_axis": 0}
         stack = object.__new__(FrameStack)
@@ -231,7 +231,7 @@ class FrameStack:
         return stack
 
     def check(self) -> None:
-        """Read the first frame of each exposure, check its values and the black level; call before long work.
+        """Read the first frame of each exposure and check its values and the black level; call it before long work.
 
         Raises:
             ValueError: see `check_frame`; also a black level above the data.
@@ -250,13 +250,13 @@ class FrameStack:
         """Part of the stack; nothing is copied or read.
 
         Args:
-            rows, columns: (start, stop) or slice of step 1, in sensor coordinates; None: all. Odd starts are
+            rows, columns: (start, stop) or a slice of step 1, in sensor coordinates; None: all. Odd starts are
                 allowed: `cfa` is rotated so that it still names the first pixel.
-            frames: slice of the frames of every exposure, or a list of slices, one for each that is selected.
+            frames: slice of the frames of every exposure, or a list of slices, one for each selected exposure.
             exposures: indices of exposure groups.
 
         Raises:
-            ValueError: an empty or outside region, or one with an odd side on a Bayer sensor; slices for another
+            ValueError: a region that is empty, outside the frames or of odd side on a Bayer sensor; slices for another
                 number of exposures.
         """
         rows, columns = span("rows", rows, self.shape[0]), span("columns", columns, self.shape[1])
@@ -281,7 +281,7 @@ class FrameStack:
         return replaced(self, **changes)
 
     def _groups(self, exposures: Any) -> np.ndarray:
-        """Indices of exposure groups. Raises TypeError for what is no list, ValueError for those that there are not."""
+        """Indices of exposure groups. Raises TypeError unless they are a list, ValueError for indices out of range."""
         given = listed("exposures", exposures, "a list of indices of exposures")
         groups = np.array([whole_number("exposures", i) for i in given], int)
         if not groups.size or groups.min() < -self.n_exposures or groups.max() >= self.n_exposures:
@@ -290,12 +290,12 @@ class FrameStack:
 
     @staticmethod
     def join(*stacks: FrameStack) -> FrameStack:
-        """The exposures of several stacks of one camera (darks and flats, say) in one, in the order given.
+        """Several stacks of one camera (darks and flats, say) joined into one, exposures in the order given.
 
         Flats of another crop or size than the darks become `elsewhere`.
 
         Raises:
-            ValueError: they differ in anything but exposures, kinds, frames and temperatures, or darks do in size.
+            ValueError: they differ in anything but exposures, kinds, frames and temperatures, or darks differ in size.
         """
         return joined(stacks)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 
-from hsnoise.likelihood.physics import Rules, evaluate, physics_of
+from hsnoise.likelihood.darks import Rules, evaluate, likelihood_part
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules
 from hsnoise.likelihood.summary import Summary, summarise, without_counts
 from hsnoise.model import NoiseModel
@@ -30,7 +30,10 @@ def log_likelihood(params: NoiseModel, stack, *, rules: Rules | None = None, **k
         raise ValueError(f"params: channels {params.channels}, but the stack has {summary.channels}")
     if params.shutter != summary.shutter:
         raise ValueError(f"params: shutter {params.shutter!r}, but the stack's is {summary.shutter!r}")
+    extra = [effect.name for effect in params if not effect.in_likelihood]
+    if extra:
+        raise ValueError(f"params: effects {extra} do not state how they change the likelihood")
     with jax.enable_x64(True):
-        physics = physics_of(params)
-        rules = plan_rules(physics, summary, CLOSE_MARGIN) if rules is None else rules
-        return _evaluate(physics, without_counts(summary), rules)  # the rules hold the counts
+        model = likelihood_part(params)
+        rules = plan_rules(model, summary, CLOSE_MARGIN) if rules is None else rules
+        return _evaluate(model, without_counts(summary), rules)  # the rules hold the counts

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import scipy  # its parts are imported when they are used
 
-from hsnoise.likelihood.physics import Physics
+from hsnoise.effects import ADC, BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
 from hsnoise.likelihood.summary import RowHistograms, Summary
+from hsnoise.model import NoiseModel
 
 CLAMPED_E = 6.0
 FURTHEST = 3.0  # factor between the gains that means and variances tell: beyond, the means tell something else
@@ -25,7 +27,28 @@ def unclip(mean, variance):
     return np.where(far, mean, position * sigma), np.where(far, variance, sigma**2)
 
 
-def start_physics(summary: Summary, with_row_gain: bool = True, with_clamp: bool = False) -> Physics:
+def model_of(
+    summary: Summary, *, gain, dark_current, read_noise, black_level, row_gain=None, black_clamp=None
+) -> NoiseModel:
+    """The paper's model of the sensor of a capture, in float64, from values of its effects.
+
+    row_gain: sigma [channel] and exponent, None for a model without; black_clamp likewise. Its default exposure is
+    the median one of the darks.
+    """
+    exposures = summary.exposure_s if len(summary.exposure_s) else summary.flats.exposure_s
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        effects = [ShotNoise(), DarkCurrent(dark_current), ReadNoise(read_noise), Gain(gain), BlackLevel(black_level)]
+        effects += [] if row_gain is None else [RowGain(*row_gain)]
+        effects += [] if black_clamp is None else [BlackClamp(black_clamp)]
+        return NoiseModel(
+            [*effects, ADC(summary.white_level_dn)],
+            cfa=summary.cfa,
+            shutter=summary.shutter,
+            exposure_s=float(np.sort(exposures)[len(exposures) // 2]),
+        )
+
+
+def start_model(summary: Summary, with_row_gain: bool = True, with_clamp: bool = False) -> NoiseModel:
     """Moment estimates: the photon transfer line of the exposures and the spread of row means.
 
     with_clamp: the camera subtracts part of the dark signal, so that the means do not tell it.
@@ -47,12 +70,12 @@ def start_physics(summary: Summary, with_row_gain: bool = True, with_clamp: bool
         ]
     )
     sigma = np.array([spread for _, _, spread, *_ in estimates])
-    return Physics(
+    return model_of(
+        summary,
         gain=gain,
-        dark_current=np.asarray(max(float(rate), 1e-9)),
-        read_noise=np.asarray(np.sqrt(max(float(read), 1e-4))),
-        row_sigma=sigma if with_row_gain else None,
-        exponent=np.asarray(0.0 if summary.shutter == "global" else 0.8),
+        dark_current=max(float(rate), 1e-9),
+        read_noise=np.sqrt(max(float(read), 1e-4)),
+        row_gain=(sigma, 0.0 if summary.shutter == "global" else 0.8) if with_row_gain else None,
         black_level=black,
         black_clamp=np.array([clamp for *_, clamp in estimates]) if with_clamp else None,
     )
@@ -67,7 +90,7 @@ def _of_one_rate(gain, dark_e, signals):
     return np.where((told > gain / FURTHEST) & (told < gain * FURTHEST), told, gain)
 
 
-def _start_of_flats(summary: Summary, with_row_gain: bool) -> Physics:
+def _start_of_flats(summary: Summary, with_row_gain: bool) -> NoiseModel:
     """Photon transfer line of flats alone."""
     flats = summary.flats
     signal = flats.mean_dn - summary.black_level_dn
@@ -75,12 +98,12 @@ def _start_of_flats(summary: Summary, with_row_gain: bool) -> Physics:
     read = np.median(np.maximum(flats.variance_dn2 - gain * signal, 0.02 * flats.variance_dn2) / gain**2)
     excess = flats.row_power_dn2 - flats.variance_dn2 / flats.row_pixels
     sigma = np.sqrt(np.clip((excess / signal**2).mean(0), 1e-6, 1.0))
-    return Physics(
+    return model_of(
+        summary,
         gain=gain,
-        dark_current=np.asarray(0.0),
-        read_noise=np.asarray(np.sqrt(read)),
-        row_sigma=sigma if with_row_gain else None,
-        exponent=np.asarray(0.0),
+        dark_current=0.0,
+        read_noise=np.sqrt(read),
+        row_gain=(sigma, 0.0) if with_row_gain else None,
         black_level=summary.black_level_dn,
     )
 

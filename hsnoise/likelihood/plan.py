@@ -12,56 +12,70 @@ import numpy as np
 
 from hsnoise._core.types import is_traced
 from hsnoise.likelihood import rows
-from hsnoise.likelihood.moments import binned_moments, start_physics
-from hsnoise.likelihood.physics import Block, Physics, RowRule, Rules, binning, dark_laws, log_probability
+from hsnoise.likelihood.darks import (
+    Block,
+    RowRule,
+    Rules,
+    binning,
+    dark_current,
+    dark_laws,
+    likelihood_part,
+    log_probability,
+    row_sigma,
+)
+from hsnoise.likelihood.moments import binned_moments, start_model
 from hsnoise.likelihood.summary import RowHistograms, Summary, round_up, without_counts
+from hsnoise.model import NoiseModel
 
 SCAN_NODES = 256
 KEEP_NATS = 25.0  # a node where every row of a group is this far below its best is left out
 # In beta on either side: so that the parameters may move during a fit, and where they are almost known.
 MARGIN, CLOSE_MARGIN = 1.35, 1.05
 EXTREME_ROWS = 6
-LEAST_SIGMA = 1e-6  # a fit may end at a row gain of exactly 0
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
 # Further nodes: where the integrand ends at a gain of zero, or each of few rows counts; and where errors average out.
 SPARE, SPARE_OF_MANY = 16, 4
 GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
 
+_At = tuple[NoiseModel, jax.Array | None]  # a model and the shares of outliers beside it
 
-def plan_rules(physics: Physics, summary: Summary, margin: float = MARGIN, channel: int | None = None) -> Rules:
-    """Quadrature rules for the rows at `physics` (at the moment estimates while `physics` is traced).
+
+def plan_rules(
+    model: NoiseModel, summary: Summary, margin: float = MARGIN, channel: int | None = None, outliers=None
+) -> Rules:
+    """Quadrature rules for the rows at `model` (at the moment estimates while `model` is traced).
 
     margin: in beta, on either side of where the rows are now (at least MARGIN while it is traced). channel: of that
-        channel only.
+        channel only. outliers: as in `evaluate`.
     """
     if not summary.histograms:
         return ()
-    if any(map(is_traced, jax.tree.leaves(physics))):
-        physics, margin = start_physics(summary, with_row_gain=physics.row_sigma is not None), max(margin, MARGIN)
+    if any(map(is_traced, jax.tree.leaves(model))):
+        model, margin = start_model(summary, with_row_gain="row_gain" in model), max(margin, MARGIN)
     channels = range(len(summary.histograms)) if channel is None else [channel]
     alike = [
         [c for c in channels if summary.histograms[c].row_stride == stride]
         for stride in sorted({summary.histograms[c].row_stride for c in channels})
     ]
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        physics = jax.tree.map(lambda x: np.asarray(x, np.float64), physics)
-        return tuple(_rule(physics, chosen, summary, margin) for chosen in alike)
+        at = jax.tree.map(np.asarray, (likelihood_part(model), outliers))
+        return tuple(_rule(at, chosen, summary, margin) for chosen in alike)
 
 
-def _rule(physics: Physics, chosen: list[int], summary: Summary, margin: float) -> RowRule:
+def _rule(at: _At, chosen: list[int], summary: Summary, margin: float) -> RowRule:
     """The rule of the channels `chosen`, which use the same share of the sensor rows."""
     stride = summary.histograms[chosen[0]].row_stride
     exposures = len(summary.exposure_s)
     channel, exposure = np.repeat(chosen, exposures), np.tile(np.arange(exposures), len(chosen))
     histograms = _used_bins([summary.histograms[c] for c in chosen])
     edges, outliers = (np.concatenate([getattr(h, name) for h in histograms]) for name in ("edges_dn", "outlier_law"))
-    if physics.row_sigma is None:
+    if "row_gain" not in at[0]:
         pooled = [h.counts.sum((1, 2), dtype=np.float64) for h in histograms]
         ones = np.ones((len(channel), 1))
         block = Block(np.concatenate(pooled)[:, None, None, :], ones, ones, nodes=1, open_below=False)
         return RowRule(channel, exposure, edges, outliers, (block,), None, ones[:, 0], stride)
-    channels = [_channel_blocks(physics, c, h, summary, margin) for c, h in zip(chosen, histograms, strict=True)]
+    channels = [_channel_blocks(at, c, h, summary, margin) for c, h in zip(chosen, histograms, strict=True)]
     layouts, scales, blocks = zip(*channels, strict=True)
     join = partial(jax.tree.map, lambda *x: np.concatenate(x))
     joined = [join(*(like(b, same) for b in same)) for same in zip(*blocks, strict=True)]
@@ -129,21 +143,22 @@ def _merged(h: RowHistograms, used: np.ndarray, kept: np.ndarray, size: int) -> 
     return replace(h, counts=counts, edges_dn=edges, outlier_law=outliers)
 
 
-def _channel_blocks(physics: Physics, c: int, histograms: RowHistograms, summary: Summary, margin: float):
+def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary, margin: float):
     """Layout, scale and blocks of one channel in all exposures."""
-    sigma = float(physics.row_sigma[c])
-    electrons = physics.dark_current * summary.exposure_s + physics.read_noise**2
+    model, _ = at
+    sigma = float(row_sigma(model)[c])
+    electrons = dark_current(model) * summary.exposure_s + model["read_noise"].sigma ** 2
     # Rounding to whole counts hides gains below this one: the rows' resolution stops being proportional to beta.
-    scale = np.clip(1 / (float(physics.gain[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
+    scale = np.clip(1 / (float(model["gain"].value[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
     bins = histograms.edges_dn, histograms.outlier_law
-    beta, table, information = (np.asarray(x) for x in _scan(physics, c, without_counts(summary), *bins, scale))
+    beta, table, information = (np.asarray(x) for x in _scan(at, c, without_counts(summary), *bins, scale))
     layout, counts = _sort_rows(histograms)
     low, high, peak = _reach(table, beta, counts)
     # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
     best = np.where(seen, information, 0).max(1) * histograms.row_pixels.max((1, 2))
     # The prior is part of what the nodes must resolve: its width in u where the rows are densest.
-    width = np.minimum(1 / np.sqrt(best + 1e-12), max(sigma, LEAST_SIGMA) / np.sqrt(scale**2 + 1))[:, None]
+    width = np.minimum(1 / np.sqrt(best + 1e-12), sigma / np.sqrt(scale**2 + 1))[:, None]
     top, bottom = 1 + rows.PRIOR_REACH * sigma, max(1 - rows.PRIOR_REACH * sigma, 0.0)
     low, high = low / margin, high * margin
     if summary.shutter == "rolling":
@@ -185,20 +200,21 @@ def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
 
 
 @jax.jit
-def _scan(physics: Physics, c: int, summary: Summary, edges_dn, outlier_law, scale):
+def _scan(sensor: _At, c: int, summary: Summary, edges_dn, outlier_law, scale):
     """On a wide grid of beta [exposure, node]: log P [exposure, node, bin], information of a pixel on asinh(beta)."""
-    sigma = physics.row_sigma[c]
+    model, outliers = sensor
+    sigma = row_sigma(model)[c]
     top = (1 + rows.PRIOR_REACH * sigma)[None]
 
     def exposure(inputs):
         at, scale = inputs
         beta = rows.make_nodes(0 * top, top, scale, sigma, SCAN_NODES).beta[0]
-        table = log_probability(physics, at, beta)
+        table = log_probability(model, outliers, at, beta)
         slope = jnp.diff(table, axis=0) / jnp.diff(jnp.arcsinh(beta / scale))[:, None]
         return beta, table, (jnp.exp(table[1:]) * slope**2).sum(-1)
 
     index = jnp.arange(len(scale))
-    laws = dark_laws(physics, summary.exposure_s)
+    laws = dark_laws(model, summary.exposure_s)
     at = binning(summary, laws, jnp.full(len(scale), c), index, edges_dn, outlier_law)
     return jax.lax.map(exposure, (at, jnp.asarray(scale)))
 

@@ -1,6 +1,6 @@
 """Figures of a fit and of the loop: functions that return a `matplotlib.figure.Figure`, without pyplot.
 
-May import fits and what they may; imported only when a figure is drawn.
+May import fits and what they may import; is imported only when a figure is drawn.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The noise budget: its components, and what they are of the whole; beside that of a model."""
+"""The noise budget: its components and their shares, beside those of a model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hsnoise._core.types import seconds
 from hsnoise.plots._style import FIT, NAMES, new_figure, tidy
 from hsnoise.statistics.decomposition import COMPONENTS
 
-ORDER = ("temporal", "row_x_frame", "column_x_frame", "frame", "pixel", "column", "row")  # changing, then static
+ORDER = ("temporal", "row_x_frame", "column_x_frame", "frame", "pixel", "column", "row")  # temporal, then static
 LABELS = {name: name.replace("_x_", " x ") for name in COMPONENTS}
 SHADES = {
     "temporal": "#0072B2",
@@ -24,17 +24,17 @@ SHADES = {
     "row": "#F0E442",
 }
 CLEAR = 2.0  # standard errors below which a component is an upper limit
-BAND = 0.7  # of the height of a component that its exposures share
+BAND = 0.7  # of a component's height, shared by its exposures
 MOST_EXPOSURES = 8
 DECADES = 9.0  # at most, below the largest component
 
 
 def budget(found, model=None) -> Figure:
-    """Components of the noise of each exposure, on a log axis, and their shares; a column of panels each colour.
+    """Components of the noise of each exposure on a log axis, and their shares; one column of panels per colour.
 
-    Above: variance of each component, one point an exposure, from the shortest (top) to the longest. Arrows: upper
-    limits, of what is not beyond two standard errors. Below: what the components are of the whole, which a log axis
-    does not show. With `model`, hollow squares and hatched bars are the budget of frames drawn from it.
+    Above: variance of each component, one point per exposure, from the shortest (top) to the longest. Arrows: upper
+    limits of components within two standard errors of 0. Below: shares of the total, which a log axis does not show.
+    With `model`, hollow squares and hatched bars are the budget of frames drawn from it.
 
     Args:
         found: result of `hsnoise.budget`.
@@ -50,7 +50,7 @@ def budget(found, model=None) -> Figure:
     of = {name: [i for i in chosen if found.rows[i].channel == name] for name in channels}
     exposures = max(len(rows) for rows in of.values())
     width, heights = max(4.8 * len(channels), 7.5), (0.35 * 7 + 0.3 * exposures + 1.2, 0.42 * exposures + 0.9)
-    title = "Noise budget" if model is None else "Noise budget: measured, and of the model"
+    title = "Noise budget" if model is None else "Noise budget: measurement and model"
     figure = new_figure(width, sum(heights) + 1.0, title)
     grid = figure.subplots(2, len(channels), squeeze=False, gridspec_kw={"height_ratios": heights})
     for c, name in enumerate(channels):
@@ -71,10 +71,10 @@ def budget(found, model=None) -> Figure:
 
 
 def _chosen(found) -> list[int]:
-    """Numbers of the rows to be drawn: of exposures of two frames or more, spread over them if they are many."""
+    """Indices of the rows to draw: exposures of two or more frames, evenly chosen if they are many."""
     told = [i for i, row in enumerate(found.rows) if row.n_frames > 1]
     if not told:
-        raise ValueError("found: the components need an exposure of two frames or more, and there is none")
+        raise ValueError("found: expected an exposure of two frames or more, got none")
     first = found.rows[told[0]].channel
     groups = [i for i in told if found.rows[i].channel == first]
     spread = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), MOST_EXPOSURES)).round().astype(int))
@@ -122,7 +122,7 @@ def _limits(axes: Axes, value, error, y, shown, face: str, edge: str) -> None:
 
 
 def _common_limits(panels) -> None:
-    """One scale for all colours: down to the least that is shown, at most DECADES below the largest."""
+    """One scale for all colours: down to the smallest value shown, at most DECADES below the largest."""
     points = [
         np.asarray(one.get_offsets())[:, 0] for axes in panels for one in axes.collections if len(one.get_offsets())
     ]
@@ -133,7 +133,7 @@ def _common_limits(panels) -> None:
 
 
 def _shares(axes: Axes, sides: list[list]) -> None:
-    """Stacked bars of shares, one an exposure, the model's below the measured one; with the total."""
+    """Stacked bars of shares, one per exposure, the model's below the measured one; with the total."""
     thick = 0.78 / len(sides)
     for of_model, rows in enumerate(sides):
         y = np.arange(len(rows)) + (of_model - (len(sides) - 1) / 2) * thick

@@ -16,13 +16,13 @@ MOST_BARS = 12
 BAR, ALARM = COLOURS["B"], COLOURS["R"]
 ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
 MOST_TICKS = 3  # to either side of 0
-MOST_LINES = 30  # powers of ten, each with a line of its own
-LETTER = 0.009  # its width, of the longest bar of a story
+MOST_LINES = 30  # powers of ten that each get a grid line
+LETTER = 0.009  # width of a letter, as a share of a story's longest bar
 LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
 def comparison(found) -> Figure:
-    """Where a model fails: misfit of each group of statistics, and the statistics that are furthest off.
+    """Where a model fails: misfit of each group of statistics, and the worst statistics.
 
     Args:
         found: result of `hsnoise.compare`.
@@ -51,7 +51,7 @@ def comparison(found) -> Figure:
     right.barh([row[0] for row in rows], z, color=_colours(np.abs(z) > NOTABLE_Z))
     _wide_scale(right)
     right.set_xlabel("(measured - model) / σ of draws\n(orange: beyond 4)")
-    right.set_title("statistics that are furthest off", fontsize=10)
+    right.set_title("worst statistics", fontsize=10)
     tidy(right)
     return figure
 
@@ -82,27 +82,27 @@ def ranking(found) -> Figure:
 
 
 def story(found) -> Figure:
-    """How far each group of statistics is off after each step of the loop, stacked, and the error.
+    """Misfit of each group of statistics after each step of the loop, stacked, and the error.
 
     Args:
         found: result of `hsnoise.improve`.
     """
     names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
     steps = [parts_of(step.comparison) for step in found.steps]
-    figure = new_figure(10.0, 0.42 * len(names) + 1.9, "How far the model is off, step by step")
+    figure = new_figure(10.0, 0.42 * len(names) + 1.9, "Misfit of the model, step by step")
     axes = figure.subplots()
     longest = max(1.0, *(sum(part.decades for part in parts) for parts in steps))
     for y, (parts, error) in enumerate(zip(steps, found.errors, strict=True)):
         _stack(axes, y, parts, longest)
         end = sum(part.decades for part in parts)
-        fits = "" if parts else ": no group is further off than the model's own samples"
+        fits = "" if parts else ": no group exceeds the model's own samples"
         axes.annotate(f"error {number(error)}{fits}", (end, y), (6, 0), textcoords="offset points", va="center")
     axes.set_xlim(0, 1.16 * longest)  # room for the error
     axes.set_ylim(len(names) - 0.45, -0.55)
     axes.set_yticks(range(len(names)), names)
     axes.xaxis.set_major_locator(MultipleLocator(1 if longest < MOST_LINES else 5))
     axes.set_xlabel(
-        "length of a part: by how many powers of ten the misfit of this group of statistics\n"
+        "length of a part: powers of ten by which the misfit of its group of statistics\n"
         "exceeds that of the model's own samples; the error is that of the worst group"
     )
     tidy(axes)
@@ -126,7 +126,7 @@ def _stack(axes: Axes, y: int, parts: list[Part], longest: float) -> None:
 
 
 def _wide_scale(axes: Axes) -> None:
-    """Linear up to 5, logarithmic beyond, either sign, with plain numbers and not too many of them."""
+    """Linear up to 5, logarithmic beyond, for both signs, with few and plain numbers."""
     low, high = 1.4 * min(axes.dataLim.x0, 0), 1.4 * max(axes.dataLim.x1, 0)
     far = max(high, -low)
     axes.set_xlim(low, high)

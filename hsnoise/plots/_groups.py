@@ -1,4 +1,4 @@
-"""Groups of statistics in the colours of the noise budget, and how far off they are as parts of a bar."""
+"""Groups of statistics in the colours of the noise budget, and their misfits as parts of a bar."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise.plots._budget import ORDER, SHADES
+from hsnoise.statistics.structure import OF_FLATS
 
 OTHER = "other"
 COLOUR_OF = {**SHADES, OTHER: "#8C8C8C"}
@@ -36,11 +37,12 @@ FAMILIES = {
     "static columns": "column",
     "static rows": "row",
 }
+FAMILIES |= {of_flats: FAMILIES[group] for group, of_flats in OF_FLATS.items()}
 PLACE = {name: i for i, name in enumerate((*ORDER, OTHER))}
 
 
 class Part(NamedTuple):
-    """One group of statistics: its misfit over that of the model's own samples, and that in powers of ten, from 0."""
+    """A group of statistics: the ratio of its misfit to that of the model's own samples, and the ratio's log10."""
 
     group: str
     family: str
@@ -49,15 +51,14 @@ class Part(NamedTuple):
 
 
 def family_of(group: str) -> str:
-    """The component of the noise budget that a group of statistics is about, or "other"."""
-    return FAMILIES.get(group.removeprefix("flats, "), OTHER)
+    """The component of the noise budget to which a group of statistics belongs, or "other"."""
+    return FAMILIES.get(group, OTHER)
 
 
 def parts_of(comparison) -> list[Part]:
-    """The groups that are further off than the model's own samples, by colour and then the worst first.
+    """The groups whose misfit exceeds that of the model's own samples, by colour, then worst first.
 
-    Misfits span many decades, and what is off by a thousand would hide what is off by ten: so each part is as long as
-    its misfit is in powers of ten.
+    Misfits span many decades, and a thousand would hide a ten, so lengths are in powers of ten.
     """
     own = comparison.own_misfit
     times = {group: misfit / own for group, misfit in comparison.groups.items()}

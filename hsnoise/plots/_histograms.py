@@ -12,8 +12,8 @@ from hsnoise.likelihood.summary import RowHistograms
 from hsnoise.plots._sampled import sampled_histograms
 from hsnoise.plots._style import COLOURS, FIT, NAMES, new_figure, tidy, title_of
 
-MOST_BINS = 90  # that can be told apart in a panel
-ENOUGH = 10.0  # expected counts from which on a residual is shown
+MOST_BINS = 90  # that a panel can resolve
+ENOUGH = 10.0  # expected counts; with fewer no residual is shown
 MOST_EXPOSURES = 6
 
 
@@ -21,10 +21,9 @@ def histograms(fit) -> Figure:
     """Counts of the dark frames, measured (steps) and fitted (line), with residuals; a panel per exposure and colour.
 
     Logarithmic, so that the tails show. Residuals are in standard deviations of a measured bin, estimated from its
-    scatter between frames (between rows if there is one frame): all pixels of a row share a gain, so that
-    a bin scatters more than its square root. The outermost bins hold all that lies beyond. Of many exposures
-    six are shown. Where pixels differ, no one distribution holds for all
-    of them: counts are then sampled from the model.
+    scatter between frames (between rows for a single frame): all pixels of a row share a gain, so a bin scatters more
+    than its square root. The outermost bins hold everything beyond. At most six exposures are shown. Where pixels
+    differ, no single distribution holds for all of them, so counts are sampled from the model.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.
@@ -34,7 +33,7 @@ def histograms(fit) -> Figure:
     """
     summary = fit.summary
     if not summary.histograms:
-        raise ValueError("fit: histograms need dark frames in the stack, and there are none")
+        raise ValueError("fit: expected dark frames in the stack, got none")
     if fit.transfer is not None:
         return sampled_histograms(fit)
     exposures = len(summary.exposure_s)
@@ -89,7 +88,7 @@ def _panel(top: Axes, strip: Axes, histograms: RowHistograms, expected: np.ndarr
 
 
 def _coarse(counts: np.ndarray, expected: np.ndarray, edges_dn: np.ndarray):
-    """Neighbouring bins together until they can be told apart in a panel.
+    """Merge neighbouring bins until a panel can resolve them.
 
     counts [frame, row, bin], expected [bin], inner edges_dn [bin - 1]. Returns measured, its standard deviation and
     expected [coarse bin], and all edges [coarse bin + 1]; the outermost bins are drawn as wide as their neighbours.
@@ -107,7 +106,7 @@ def _coarse(counts: np.ndarray, expected: np.ndarray, edges_dn: np.ndarray):
 
 
 def _visible(measured, sigma, expected, edges):
-    """Without the empty bins at either end, and without bins of no width (codes beyond the white level)."""
+    """Drop empty bins at either end, and bins of zero width (codes beyond the white level)."""
     filled = np.flatnonzero((measured > 0) | (expected > 0.5))
     part = np.arange(filled[0], filled[-1] + 1)
     part = part[np.diff(edges)[part] > 0]

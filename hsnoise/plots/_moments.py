@@ -1,11 +1,12 @@
-"""What the fitted model expects of the mean and the variance of counts, clipping and rounding included."""
+"""Mean and variance of counts expected by the fitted model, including clipping and rounding."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hsnoise.likelihood.physics import Physics, black_level_at
+from hsnoise.likelihood.darks import black_level_at, dark_current
 from hsnoise.lut import clipped_moments
+from hsnoise.model import NoiseModel
 
 BETA_NODES = 32
 LEAST_BETA = 1e-6
@@ -17,18 +18,18 @@ def beta_rule(sigma: float) -> tuple[np.ndarray, np.ndarray]:
     return 1 + sigma * z, weight / weight.sum()
 
 
-def count_moments(physics: Physics, c: int, exposure_s, beta, white_level_dn: float | None):
+def count_moments(model: NoiseModel, c: int, exposure_s, beta, white_level_dn: float | None):
     """Mean above black (DN) and variance (DN^2) of a pixel's count, [exposure, beta], for channel number `c`.
 
     exposure_s [exposure] in s; beta [beta], gains below zero count as zero. Counts are rounded, and clipped at 0
     and at the white level.
     """
-    gain = float(physics.gain[c]) * np.maximum(np.asarray(beta)[None, :], LEAST_BETA)
-    mean_e = float(physics.dark_current) * np.asarray(exposure_s)[:, None]
-    black = black_level_at(physics, np.asarray(exposure_s))[:, c, None]
+    gain = float(model["gain"].value[c]) * np.maximum(np.asarray(beta)[None, :], LEAST_BETA)
+    mean_e = float(dark_current(model)) * np.asarray(exposure_s)[:, None]
+    black = black_level_at(model, np.asarray(exposure_s))[:, c, None]
     mean, variance = clipped_moments(
         gain * mean_e,
-        gain**2 * (mean_e + float(physics.read_noise) ** 2),
+        gain**2 * (mean_e + float(model["read_noise"].sigma) ** 2),
         gain=gain + 0 * mean_e,
         black_level_dn=black + 0 * gain,
         white_level_dn=white_level_dn,

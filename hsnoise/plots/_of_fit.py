@@ -1,9 +1,10 @@
-"""All figures that a fit can have."""
+"""All figures of a fit."""
 
 from __future__ import annotations
 
 from matplotlib.figure import Figure
 
+from hsnoise.fitting.result import Method
 from hsnoise.plots._histograms import histograms
 from hsnoise.plots._photon_transfer import has_photon_transfer, photon_transfer
 from hsnoise.plots._pixel_map import pixel_map
@@ -13,14 +14,14 @@ from hsnoise.plots._sampled import dark_current
 
 
 def of_fit(fit) -> dict[str, Figure]:
-    """The figures of a fit by name: those that its frames and its method allow.
+    """The figures of a fit by name, as far as its frames and method allow.
 
-    A fit of several effects by simulated statistics has none: they would lack the added effects.
+    A fit of several effects by simulated statistics has none: the figures would lack the added effects.
 
     Args:
         fit: result of `hsnoise.fit`.
     """
-    if fit.method == "synthetic":
+    if fit.method == Method.SYNTHETIC:
         return {}
     conditional = fit.transfer is not None
     drawings = {

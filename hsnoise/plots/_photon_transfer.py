@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hsnoise.likelihood.darks import black_level_at, dark_current, flat_gain_of
 from hsnoise.likelihood.flat_gain import FlatGain, local_gain, variance_curve
 from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.likelihood.moments import binned_moments
-from hsnoise.likelihood.physics import Physics, black_level_at, flat_gain_of
 from hsnoise.likelihood.summary import RowHistograms, Summary, far_outliers
+from hsnoise.model import NoiseModel
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, plain_log, tidy, title_of
@@ -25,13 +26,12 @@ CURVE_POINTS = 40
 def photon_transfer(fit) -> Figure:
     """Variance against mean of the counts, measured and fitted: the photon transfer curve.
 
-    Darks: one point per exposure and colour, its variance taken within rows, so that row offsets and the spread
-    of row gains between rows do not enter, nor do pixels far hotter than all others. Where pixels differ, that is no
-    noise: there, classes of pixels over time are shown (`pixel_transfer`). Flats: one point per level and
-    colour, temporal variance within rows above that of the darks; and that over signal, with the curve that was fitted
-    and the gain that follows from it at each signal. Solid: what the fitted model expects of the recorded counts;
-    dashed, where clipping matters: what the sensor delivered before it was clipped. Hollow points: more than 0.1 % of
-    the pixels are clipped, or a level was left out.
+    Darks: one point per exposure and colour, with the variance within rows. Row offsets, the spread of row gains and
+    pixels far hotter than all others do not enter. Where pixels differ, that variance is not noise, and classes of
+    pixels over time are shown instead (`pixel_transfer`). Flats: one point per level and colour, temporal variance
+    within rows above that of the darks; and that variance over signal, with the fitted curve and the local gain.
+    Solid: the fitted model of the recorded counts. Dashed, where clipping matters: the model before clipping. Hollow
+    points: more than 0.1 % of the pixels are clipped, or the level was left out.
 
     Args:
         fit: result of `hsnoise.fit`.
@@ -43,7 +43,7 @@ def photon_transfer(fit) -> Figure:
     """
     panels = _panels(fit)
     if not panels:
-        raise ValueError("fit: where pixels differ, photon transfer needs darks of two exposures, or flats")
+        raise ValueError("fit: expected darks of two exposures, or flats, because pixels differ; got neither")
     title = "Photon transfer: variance against mean of the counts"
     title = title_of(title, fit) if fit.transfer is None else title
     figure = new_figure(6.4 * len(panels), 5.0, title)
@@ -60,14 +60,14 @@ def has_photon_transfer(fit) -> bool:
 
 
 def _panels(fit) -> list[Callable[[Axes], None]]:
-    summary, physics = fit.summary, fit.physics
+    summary, model = fit.summary, fit.params
     panels: list[Callable[[Axes], None]] = []
     if transfers_of(fit):
         panels.append(partial(_classes, fit=fit))
     elif fit.transfer is None and summary.histograms:
-        panels.append(partial(_darks, physics=physics, summary=summary))
+        panels.append(partial(_darks, model=model, summary=summary))
     if summary.flats is not None and summary.flats.mean_dn.size:
-        panels += [partial(draw, physics=physics, summary=summary) for draw in (_flats, _gains)]
+        panels += [partial(draw, model=model, summary=summary) for draw in (_flats, _gains)]
     return panels
 
 
@@ -78,23 +78,23 @@ def _classes(axes: Axes, fit) -> None:
     axes.set_xlabel("dark signal / DN")
 
 
-def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
+def _darks(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     axes.set_title("dark frames, one point per exposure", fontsize=10)
     axes.set_ylabel("variance within rows / DN²")
     far = far_outliers(summary) > 0
     t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
-        channel, black = histograms.channel, black_level_at(physics, summary.exposure_s)[:, c]
+        channel, black = histograms.channel, black_level_at(model, summary.exposure_s)[:, c]
         colour = COLOURS[channel]
         mean, variance, error = _within_rows(histograms, far & ~_reaches_white(histograms, summary.white_level_dn))
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION
         _points(axes, channel, mean - black, variance, clipped, error)
-        x, y = _expected(physics, c, t, summary.white_level_dn)
+        x, y = _expected(model, c, t, summary.white_level_dn)
         axes.plot(x, y, linewidth=1.6, color=colour)
         if clipped.any():
             any_clipped = True
-            axes.plot(*_unclipped(physics, c, t), "--", linewidth=1.2, color=colour)
+            axes.plot(*_unclipped(model, c, t), "--", linewidth=1.2, color=colour)
     axes.plot([], [], "-", color="0.3", label="fitted model")
     if any_clipped:
         axes.plot([], [], "--", color="0.3", label="fitted, before clipping")
@@ -103,18 +103,18 @@ def _darks(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.legend(fontsize=9, framealpha=0.9)
 
 
-def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
+def _flats(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     axes.set_title("flat frames, one point per level", fontsize=10)
     axes.set_ylabel("variance above that of darks / DN²")
-    found = flat_gain_of(physics, summary.flats)
+    found = flat_gain_of(model, summary.flats)
     for c, channel in enumerate(summary.channels):
         signal, shown = _levels(found, c)
         gain, error = found.level_gain[shown, c], found.level_error[shown, c]
         _points(axes, channel, signal, gain * signal, ~found.used[shown, c], error * signal)
         if len(signal):
             light_dn = np.geomspace(signal.min() / 2, signal.max() * 1.5, CURVE_POINTS)
-            expected = float(physics.gain[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
-            axes.plot(light_dn, expected * (1 + _row_sigma(physics, c) ** 2), color=COLOURS[channel], linewidth=1.6)
+            expected = float(model["gain"].value[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
+            axes.plot(light_dn, expected * (1 + _row_sigma(model, c) ** 2), color=COLOURS[channel], linewidth=1.6)
     axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -123,11 +123,11 @@ def _flats(axes: Axes, physics: Physics, summary: Summary) -> None:
     axes.legend(fontsize=9, framealpha=0.9)
 
 
-def _gains(axes: Axes, physics: Physics, summary: Summary) -> None:
-    """Variance over signal of the flats and the local gain: level where the response is straight."""
+def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
+    """Variance over signal of the flats and the local gain: horizontal where the response is linear."""
     axes.set_title("flat frames: gain against signal", fontsize=10)
     axes.set_ylabel("variance over signal, gain / (DN/e$^-$)")
-    found = flat_gain_of(physics, summary.flats)
+    found = flat_gain_of(model, summary.flats)
     for c, channel in enumerate(summary.channels):
         signal, shown = _levels(found, c)
         used = found.used[shown, c]
@@ -147,7 +147,7 @@ def _gains(axes: Axes, physics: Physics, summary: Summary) -> None:
 
 
 def _gain_limits(axes: Axes, found: FlatGain) -> None:
-    """Limits by the levels that gave the gain: those near saturation may fall far below."""
+    """Limits from the levels that gave the gain: levels near saturation may fall far below."""
     shown = found.level_gain[found.used]
     if shown.size:
         low, high = min(shown.min(), found.gain.min()), max(shown.max(), found.gain.max())
@@ -156,7 +156,7 @@ def _gain_limits(axes: Axes, found: FlatGain) -> None:
 
 
 def _levels(found: FlatGain, c: int) -> tuple[np.ndarray, np.ndarray]:
-    """Signals, DN, of the levels of a channel that can be drawn, and where they are [level]."""
+    """Signals, DN, of a channel's levels that can be drawn, and the mask that selects them [level]."""
     shown = np.isfinite(found.level_gain[:, c]) & (found.level_gain[:, c] > 0)
     return found.signal_dn[shown, c], shown
 
@@ -172,7 +172,7 @@ def _points(axes: Axes, channel: str, x, y, clipped, error) -> None:
 def _within_rows(histograms: RowHistograms, far: np.ndarray):
     """Mean (DN), variance within rows (DN^2) and its standard error over frames, each [exposure].
 
-    far [exposure]: whether pixels beyond all bins, far hotter than the others, are to be left out.
+    far [exposure]: whether to leave out pixels beyond all bins, far hotter than the others.
     """
     pixels = histograms.row_pixels  # [exposure, frame, row]; 0 in padding
     used = pixels[..., 0] > 0
@@ -204,23 +204,23 @@ def clipped_fraction(histograms: RowHistograms, white_level_dn: float | None) ->
     return (at_zero + np.where(_reaches_white(histograms, white_level_dn), counts[:, -1], 0.0)) / counts.sum(1)
 
 
-def _expected(physics: Physics, c: int, exposure_s, white_level_dn: float | None):
+def _expected(model: NoiseModel, c: int, exposure_s, white_level_dn: float | None):
     """Mean above black and variance within rows of the recorded counts, averaged over the row gain; [exposure]."""
-    beta, weight = beta_rule(_row_sigma(physics, c))
-    mean, variance = count_moments(physics, c, exposure_s, beta, white_level_dn)
+    beta, weight = beta_rule(_row_sigma(model, c))
+    mean, variance = count_moments(model, c, exposure_s, beta, white_level_dn)
     return mean @ weight, variance @ weight
 
 
-def _unclipped(physics: Physics, c: int, exposure_s):
-    """Mean above black and variance within rows of counts that nothing clips."""
-    signal = float(physics.gain[c]) * float(physics.dark_current) * exposure_s
-    return signal, _line(physics, c, signal)
+def _unclipped(model: NoiseModel, c: int, exposure_s):
+    """Mean above black and variance within rows of counts before clipping."""
+    signal = float(model["gain"].value[c]) * float(dark_current(model)) * exposure_s
+    return signal, _line(model, c, signal)
 
 
-def _line(physics: Physics, c: int, signal_dn):
-    gain, read_noise_e = float(physics.gain[c]), float(physics.read_noise)
-    return (gain * signal_dn + (gain * read_noise_e) ** 2) * (1 + _row_sigma(physics, c) ** 2) + ROUNDING_VARIANCE
+def _line(model: NoiseModel, c: int, signal_dn):
+    gain, read_noise_e = float(model["gain"].value[c]), float(model["read_noise"].sigma)
+    return (gain * signal_dn + (gain * read_noise_e) ** 2) * (1 + _row_sigma(model, c) ** 2) + ROUNDING_VARIANCE
 
 
-def _row_sigma(physics: Physics, c: int) -> float:
-    return 0.0 if physics.row_sigma is None else float(physics.row_sigma[c])
+def _row_sigma(model: NoiseModel, c: int) -> float:
+    return float(model["row_gain"].sigma[c]) if "row_gain" in model else 0.0

@@ -1,4 +1,4 @@
-"""Where on the sensor the pixels lie that were set apart."""
+"""Map of the flagged pixels on the sensor."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from hsnoise.plots._style import new_figure, tidy
 from hsnoise.statistics.pixels.flags import FLAGS
 
-MOST_DOTS = 1500  # of a kind, beyond which a density is drawn
+MOST_DOTS = 1500  # of one kind; more are drawn as a density
 BLOCKS = 96  # along the longer side of a density
 COLOURS = {"stuck": "#0072B2", "dead": "black", "hot": "#D55E00", "telegraph": "#009E73"}
 MARKERS = {"stuck": "s", "dead": "x", "hot": "o", "telegraph": "^"}
 MEANINGS = {"stuck": "stuck", "dead": "dead", "hot": "hot", "telegraph": "telegraph-like"}
-PER_BLOCK = 6.0  # pixels in a block of the density, that chance is not all that shows
-HIGHEST = 0.995  # quantile of the blocks at the end of the colours
+PER_BLOCK = 6.0  # pixels in a block of the density, so that it shows more than chance
+HIGHEST = 0.995  # quantile of the blocks at the end of the colour scale
 
 
 def pixel_map(fit) -> Figure:
@@ -25,7 +25,7 @@ def pixel_map(fit) -> Figure:
         fit: result of `hsnoise.fit`, of frames with a dark exposure of two frames or more.
 
     Raises:
-        ValueError: whatever `fit.pixels` raises.
+        ValueError: as `fit.pixels` raises.
     """
     flags = fit.pixels.flags
     rows, columns = flags.shape
@@ -71,7 +71,7 @@ def _density(figure: Figure, axes: Axes, name: str, places: np.ndarray, shape: t
 
 
 def _legend(figure: Figure, found: dict[str, np.ndarray], many: list[str], pixels: int, lit: bool) -> None:
-    """Numbers and shares of all kinds; those that are a density have no marker."""
+    """Numbers and shares of all kinds; densities have no marker."""
     handles = []
     for name, places in found.items():
         label = (

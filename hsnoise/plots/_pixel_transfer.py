@@ -1,4 +1,4 @@
-"""Pixel transfer of a fit where pixels differ: variance over time against dark signal, by class of pixels."""
+"""Pixel transfer of a fit: variance over time against dark signal, by class of pixels."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from hsnoise.statistics.pixels.transfer import Transfer
 
 CURVE_POINTS = 200
 FAR = 1.25  # times the largest signal: the end of the axis
-TELLING = 0.5  # relative error up to which the gain of one class is shown
-CHANCE, NEAR = 0.1, 0.2  # quantiles of all signals, and of those above 0, within which the axis is linear
-MOST_ERRORS = 3.0  # of the gain: beyond it a single class is out of the picture
+TELLING = 0.5  # largest relative error at which the gain of a class is shown
+CHANCE, NEAR = 0.1, 0.2  # quantiles of all signals, and of the positive ones, within which the axis is linear
+MOST_ERRORS = 3.0  # of the gain, beyond which single classes are off the axis
 
 
 def pixel_transfer(fit) -> Figure:
-    """Variance of single pixels over time against their dark signal, by class of pixels; one column a colour.
+    """Variance of single pixels over time against their dark signal, by class of pixels; one column per colour.
 
-    Above: temporal variance of each class and exposure, with the lines of ordinary pixels (round) and of hot ones
+    Above: temporal variance of each class and exposure, with the lines fitted to ordinary pixels (round) and hot pixels
     (diamonds), whose Fano factor is below 1. Middle: growth of the variance over growth of the level of each class,
-    which is its gain, with the gain of the fit. Below: what the fit leaves, in standard errors. Signals near 0 are on
-    a linear scale, others on a logarithmic one, so that the brightest pixels do not squash the ordinary ones.
+    which is its gain, with the gain of the fit. Below: residuals in standard errors. Signals near 0 are on a linear
+    scale, others on a logarithmic one, so that the brightest pixels do not squash the ordinary ones.
 
     Args:
-        fit: result of `hsnoise.fit`, where pixels differ and darks have two exposures.
+        fit: result of `hsnoise.fit` in which pixels differ, with darks of two exposures.
 
     Raises:
-        ValueError: a fit that pooled its pixels, or of one exposure.
+        ValueError: a fit that pooled its pixels, or has one exposure.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """
     channels = transfers_of(fit)
     if not channels:
         raise ValueError(
-            "fit: pixel transfer needs a fit where pixels differ (fit.transfer) and darks of two exposures, which this"
-            " one has not"
+            "fit: pixel transfer needs a fit where pixels differ (fit.transfer) and darks of two exposures; this one"
+            " has no pixel transfer"
         )
     width = max(4.6 * len(channels), 7.0)
     figure = new_figure(width, 9.5, "Pixel transfer: variance of single pixels over time against their dark signal")
@@ -63,7 +63,7 @@ def transfers_of(fit) -> list[tuple[str, Transfer]]:
 
 
 def signal_of(transfer: Transfer) -> np.ndarray:
-    """Dark signal of each class and exposure, moved pedestals taken off [class, exposure], DN."""
+    """Dark signal of each class and exposure without moved pedestals [class, exposure], DN."""
     classes, t = transfer.classes, transfer.classes.exposure_s
     level = classes.level_dn - transfer.pedestal_dn
     shortest = int(t.argmin())
@@ -71,7 +71,7 @@ def signal_of(transfer: Transfer) -> np.ndarray:
 
 
 def draw_variances(axes: Axes, channels: list[tuple[str, Transfer]]) -> None:
-    """Variance against dark signal of all classes, and the lines of ordinary and hot pixels, of one colour or more."""
+    """Variance against dark signal of all classes, and the fitted lines of ordinary and hot pixels, by colour."""
     several = len(channels) > 1
     for name, transfer in channels:
         _points(axes, name, transfer, signal_of(transfer), transfer.classes.variance_dn2)
@@ -117,7 +117,7 @@ def _with_error(gain: float, error: float) -> str:
 
 
 def _near(x: np.ndarray) -> float:
-    """Signal below which the axis is linear: small ones, and what chance makes of none."""
+    """Signal below which the axis is linear: small signals, and scatter around 0."""
     small = float(np.quantile(x[x > 0], NEAR)) if (x > 0).any() else 1.0
     return max(small, -2 * float(np.quantile(x, CHANCE)))
 

@@ -8,17 +8,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hsnoise._core.types import seconds
+from hsnoise.effects import RowGain
 from hsnoise.likelihood import rows
-from hsnoise.likelihood.physics import Physics
 from hsnoise.likelihood.summary import RowHistograms, Summary
 from hsnoise.plots._moments import beta_rule, count_moments
 from hsnoise.plots._pixel_transfer import transfers_of
 from hsnoise.plots._style import COLOURS, FIT, MARKERS, NAMES, new_figure, tidy, title_of
 
 BANDS_PER_OCTAVE = 3
-SHOWN_IN_DARKS = 1e-3  # row gain that flats may know, but no dark shows, is below
+SHOWN_IN_DARKS = 1e-3  # smaller row gains are invisible in darks; flats may still determine them
 SMALLEST_SIGMA = 1e-6
-FAINT = 0.01  # of the least power that is measured: a row gain below that is left out
+FAINT = 0.01  # of the smallest measured power: a weaker row gain is left out
 ALONE = "row gain alone"
 LEGEND = ("measured", "measured, in bands", "fitted: row gain + pixel noise", ALONE, "pixel noise alone")
 
@@ -26,22 +26,22 @@ LEGEND = ("measured", "measured, in bands", "fitted: row gain + pixel noise", AL
 def row_spectrum(fit) -> Figure:
     """Power spectrum of the row gain along the rows, measured and fitted, log-log; one panel per colour.
 
-    Measured: the periodogram of row means, divided by how strongly the mean of a row depends on its gain, averaged
-    over the frames of the exposure that shows the row gain best. What a row has in all frames (hot pixels, fixed
-    patterns) is no row gain and is taken off, unless there is one frame. Fitted: row gain plus what the noise of the
-    pixels leaves in a row mean. Power is normalised so that its mean over all frequencies is the variance over rows.
+    Measured: the periodogram of row means, divided by the response of a row mean to its gain, averaged over the frames
+    of the exposure that shows the row gain best. Each row's mean over frames (hot pixels, fixed patterns) is not row
+    gain and is subtracted, unless there is a single frame. Fitted: row gain plus the pixel noise in a row mean. Power
+    is normalised so that its mean over all frequencies is the variance over rows.
 
     Args:
         fit: result of `hsnoise.fit`, of a stack with dark frames.
 
     Raises:
-        ValueError: there are no dark frames, no row gain in the model, or no dark signal that would show it.
+        ValueError: there are no dark frames, no row gain in the model, or no dark signal to show it.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019, Fig. 3.
     """
     summary = fit.summary
     if not has_row_spectrum(fit):
-        raise ValueError("fit: a row spectrum needs dark frames, row_gain in the model, and dark signal that shows it")
+        raise ValueError("fit: a row spectrum needs dark frames, row_gain in the model, and dark signal to show it")
     channels = len(summary.histograms)
     title = title_of("Spectrum of the row gain", fit) if fit.transfer is None else "Spectrum of the row gain"
     figure = new_figure(max(4.3 * channels, 6.4), 4.6, title)
@@ -63,16 +63,16 @@ def row_spectrum(fit) -> Figure:
 
 
 def has_row_spectrum(fit) -> bool:
-    """Whether the frames show the row gain; where pixels differ, only one that is large enough for darks to show."""
-    if not fit.summary.histograms or fit.physics.row_sigma is None:
+    """Whether the frames show the row gain; where pixels differ, only if it is large enough to show in darks."""
+    if not fit.summary.histograms or "row_gain" not in fit.params:
         return False
     if fit.transfer is None:
         return True
-    return bool(transfers_of(fit)) and bool(np.max(fit.physics.row_sigma) > SHOWN_IN_DARKS)
+    return bool(transfers_of(fit)) and bool(np.max(fit.params["row_gain"].sigma) > SHOWN_IN_DARKS)
 
 
 def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:
-    summary, physics = fit.summary, fit.physics
+    summary, row_gain = fit.summary, fit.params["row_gain"]
     slope, noise = (_response if fit.transfer is None else _of_pixels)(fit, c, histograms)
     e = int(np.argmax(slope**2 / noise))
     row_mean = _row_means(histograms, e)
@@ -82,8 +82,8 @@ def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:
     k = np.arange(1, n_rows // 2 + 1)
     power = (np.abs(np.fft.rfft(row_mean, axis=1)) ** 2).mean(0)[1:] / n_rows / slope[e] ** 2
     floor = noise[e] / slope[e] ** 2
-    sigma = max(float(physics.row_sigma[c]), SMALLEST_SIGMA)
-    fitted = sigma**2 * _shape(physics, summary, histograms)[k]
+    sigma = max(float(row_gain.sigma[c]), SMALLEST_SIGMA)
+    fitted = sigma**2 * _shape(row_gain, summary, histograms)[k]
     colour, channel = COLOURS[histograms.channel], histograms.channel
     axes.loglog(k, power, ".", color=colour, alpha=0.35, markersize=4, label="measured")
     x, y, error = _bands(k, power, frames)
@@ -111,11 +111,11 @@ def _count(frames: int) -> str:
 
 
 def _response(fit, c: int, histograms: RowHistograms):
-    """Change of a row's mean with its gain (DN) and variance of a row mean from its pixels (DN^2): [exposure]."""
-    physics, summary = fit.physics, fit.summary
-    sigma = max(float(physics.row_sigma[c]), 1e-3)
+    """Change of a row's mean with its gain (DN), and variance of a row mean from its pixels (DN^2): [exposure]."""
+    summary = fit.summary
+    sigma = max(float(fit.params["row_gain"].sigma[c]), 1e-3)
     beta, weight = beta_rule(sigma)
-    mean, variance = count_moments(physics, c, summary.exposure_s, beta, summary.white_level_dn)
+    mean, variance = count_moments(fit.params, c, summary.exposure_s, beta, summary.white_level_dn)
     slope = mean @ (weight * (beta - 1)) / sigma**2
     return slope, variance @ weight / histograms.row_pixels.max((1, 2))
 
@@ -136,15 +136,15 @@ def _row_means(histograms: RowHistograms, exposure: int) -> np.ndarray:
     return histograms.row_sum[exposure][used] / pixels[used]
 
 
-def _shape(physics: Physics, summary: Summary, histograms: RowHistograms) -> np.ndarray:
+def _shape(row_gain: RowGain, summary: Summary, histograms: RowHistograms) -> np.ndarray:
     """Spectrum of unit variance of the colour's rows, [row]."""
     n_rows = histograms.row_sum.shape[2]
     if summary.shutter == "global":
         return np.ones(n_rows)
     with jax.enable_x64(True):
         sensor_rows = n_rows * histograms.row_stride
-        exponent = np.asarray(physics.exponent, np.float64)
-        return np.asarray(rows.row_spectrum(exponent, sensor_rows, histograms.row_stride, physics.white_share))
+        exponent, white_share = (np.asarray(x, np.float64) for x in (row_gain.exponent, row_gain.white_share))
+        return np.asarray(rows.row_spectrum(exponent, sensor_rows, histograms.row_stride, white_share))
 
 
 def _bands(k: np.ndarray, power: np.ndarray, frames: int):

@@ -1,4 +1,4 @@
-"""Figures of how pixels differ, measured beside frames that are drawn from the fit."""
+"""Figures of how pixels differ: measured frames beside frames drawn from the fit."""
 
 from __future__ import annotations
 
@@ -9,38 +9,40 @@ from matplotlib.ticker import NullLocator
 
 from hsnoise._core.types import cfa_tile, seconds
 from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.darks import black_level
 from hsnoise.plots._style import COLOURS, FIT, NAMES, bend_axis, new_figure, tidy
-from hsnoise.simulation.draws import draw_capture, middle_of
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import middle_of
 from hsnoise.statistics.pixels.classes import growth_noise, levels_of, slope_over
 from hsnoise.statistics.pixels.survey import survey
 
-CORE = (5e-4, 0.97)  # quantiles between which bins are equally wide
-CORE_BINS, WIDER = 60, 1.25  # bins of the core; how much wider each beyond is
-FEWEST = 5  # counts in a bin of which a ratio is shown
+CORE = (5e-4, 0.97)  # quantiles between which bins have equal width
+CORE_BINS, WIDER = 60, 1.25  # bins of the core; factor by which each bin outside is wider than the last
+FEWEST = 5  # counts in a bin that are enough to show a ratio
 MOST_RATIO = 10.0
 RATIOS = (0.1, 0.2, 0.5, 1, 2, 5, 10)
 MOST_EXPOSURES = 6
-WIDE = 3.0  # times the core, from which an axis is bent
+WIDE = 3.0  # times the core; wider axes become logarithmic outside
 
 
 def drawn_beside(fit) -> tuple[FrameStack, FrameStack]:
-    """The middle of a fit's darks, and frames drawn from its model as these were taken.
+    """The middle of a fit's darks, and frames drawn from its model under the same conditions.
 
     Raises ValueError for a fit without frames or darks.
     """
     if fit.stack is None:
-        raise ValueError("fit: this figure needs the frames of the fit, and it was made from a Summary")
+        raise ValueError("fit: expected a fit of frames, got one of a Summary")
     part = middle_of(fit.stack, ("dark",))
     return part, draw_capture(0, fit.params, part)
 
 
 def dark_current(fit) -> Figure:
-    """How dark current differs between pixels, measured beside sampled; one column a colour.
+    """How dark current differs between pixels, measured beside sampled; one column per colour.
 
-    Dark current of a pixel is the growth of its level with exposure. Chance moves that, too: the frames that are drawn
-    from the fit are as many, and evaluated in the same way, so that both distributions hold the same noise. Above:
-    how many pixels have which dark current, and, shaded, the noise of one pixel's estimate; below: which share has
-    more. Of large frames the middle is shown.
+    The dark current of a pixel is the growth of its level with exposure, which noise also affects. As many frames are
+    drawn from the fit and evaluated in the same way, so both distributions contain the same noise. Above: the
+    distribution of dark current, and, shaded, the noise of one pixel's estimate. Below: the share of pixels above each
+    dark current. Only the middle of large frames is shown.
 
     Args:
         fit: result of `hsnoise.fit`, of darks of two exposures with two frames each.
@@ -51,7 +53,7 @@ def dark_current(fit) -> Figure:
     part, drawn = drawn_beside(fit)
     measured, sampled = _growths(part), _growths(drawn)
     if not measured:
-        raise ValueError("fit: dark current needs darks of two exposures with two frames or more, and there are none")
+        raise ValueError("fit: expected darks of two exposures with two frames or more, got none")
     gain, unit = _unit(fit)
     width = max(4.6 * len(measured), 7.0)
     figure = new_figure(width, 7.2, "Dark current of single pixels: measured, and sampled from the fit")
@@ -69,15 +71,15 @@ def dark_current(fit) -> Figure:
 
 
 def _growths(stack: FrameStack) -> list[np.ndarray]:
-    """Growth of the sampled pixels in two halves of the frames [half, pixel], DN/s; of each colour."""
+    """Growth of the sampled pixels in two halves of the frames [half, pixel], DN/s, for each colour."""
     found = survey(stack)
     levels = [levels_of(found, c) for c in range(len(found.channels))]
     return [slope_over(one.exposure_s, one.level) for one in levels if one is not None]
 
 
 def _unit(fit) -> tuple[np.ndarray, str]:
-    """What to divide by [channel], and the unit: electrons where the gain is known."""
-    gain = np.asarray(fit.physics.gain)
+    """The divisor [channel] and the unit: electrons if the gain is known."""
+    gain = np.asarray(fit.params["gain"].value)
     known = fit.has_gain
     return (gain, "e$^-$/s") if known else (np.ones_like(gain), "DN/s")
 
@@ -100,10 +102,10 @@ def _population(panels, name: str, measured: np.ndarray, sampled: np.ndarray, no
 
 
 def sampled_histograms(fit) -> Figure:
-    """Counts of the dark frames, measured beside sampled, where pixels differ; a panel per exposure and colour.
+    """Counts of the dark frames where pixels differ, measured beside sampled; a panel per exposure and colour.
 
-    Here no one distribution holds for all pixels, so that frames are drawn from the fit. The strips show how many
-    times more pixels were measured than sampled. Errors are those of pixels that keep their counts in all frames.
+    No single distribution holds for all pixels here, so frames are drawn from the fit. The strips show the ratio of
+    measured to sampled pixels. Errors assume that pixels keep their counts in all frames.
     """
     part, drawn = drawn_beside(fit)
     shown = np.unique(np.linspace(0, part.n_exposures - 1, min(part.n_exposures, MOST_EXPOSURES)).round().astype(int))
@@ -111,7 +113,7 @@ def sampled_histograms(fit) -> Figure:
     title = "Counts of the dark frames: measured, and sampled from the fit"
     figure = new_figure(max(4.3 * columns, 6.4), 3.1 * len(shown) + 0.5, title)
     grid = figure.subplots(2 * len(shown), columns, squeeze=False, gridspec_kw={"height_ratios": [3, 1.2] * len(shown)})
-    black = np.broadcast_to(np.asarray(fit.physics.black_level), columns)
+    black = np.asarray(black_level(fit.params))
     for i, e in enumerate(shown):
         for c, name in enumerate(part.channels):
             top, strip = grid[2 * i, c], grid[2 * i + 1, c]
@@ -142,9 +144,9 @@ def _counts(stack: FrameStack, exposure: int, channel: int) -> np.ndarray:
 
 
 def edges_of(measured: np.ndarray, sampled: np.ndarray, black_dn: float | None = None) -> np.ndarray:
-    """Edges of bins: equal ones for the core, ever wider ones for the tails.
+    """Edges of bins: equal bins for the core, ever wider bins for the tails.
 
-    With `black_dn`, values are whole counts less this, and edges lie between counts.
+    With `black_dn`, values are whole counts minus `black_dn`, and edges lie between counts.
     """
     both = np.concatenate([measured, sampled])
     low, high = np.quantile(both, CORE)
@@ -161,7 +163,7 @@ def edges_of(measured: np.ndarray, sampled: np.ndarray, black_dn: float | None =
 
 
 def _widening(step: float, far: float, whole: bool) -> np.ndarray:
-    """Distances from the core up to beyond `far`, each step wider than the one before."""
+    """Distances from the core to beyond `far`, each step wider than the one before."""
     bins = int(np.ceil(np.log1p(far / step * (WIDER - 1)) / np.log(WIDER))) + 1
     widths = step * WIDER ** np.arange(1, bins + 1)
     return np.cumsum(np.round(widths / step) * step if whole else widths)

@@ -36,7 +36,7 @@ def clip_table_figure(
     variance_dn2: tuple[float, float] = (2.0, 60.0),
     points: int = 240,
 ) -> ClipTableFigure:
-    """Both tables over the clipped moments of darks; by default those of the Canon's red pixels at black 0.
+    """Both tables over the clipped moments of darks; by default for the Canon's red pixels at black 0.
 
     Args:
         gain: DN/e-; black_level_dn, white_level_dn as in `make_clip_tables`.
@@ -44,7 +44,7 @@ def clip_table_figure(
         variance_dn2: range of clipped variances, DN^2.
         points: along each axis.
 
-    Where `solved` is false no Poisson + normal law of this gain has the pair, and the true moments are NaN.
+    Where `solved` is false, no Poisson + normal distribution of this gain has the pair, and true moments are NaN.
     """
     mean, variance = np.linspace(*mean_dn, points), np.linspace(*variance_dn2, points)
     tables = make_clip_tables(
@@ -59,14 +59,14 @@ def clip_table_figure(
 def clip_tables(gain_dn_per_e: float = 1.53, **keywords) -> Figure:
     """True mean and variance of noise against those of its clipped counts: two panels.
 
-    A pair of clipped mean and variance is a point; colour and contours say what the unclipped noise has. Far to
-    the right nothing is clipped and the contours are straight. Hatched: no Poisson and normal noise of this
-    gain has such counts, because their mean is below that of noise around black (left), or their variance below
-    that of shot noise (right).
+    A pair of clipped mean and variance is a point; colour and contours show the unclipped moments. Far to the right
+    nothing is clipped and the contours are straight. Hatched: no Poisson plus normal noise of this gain has these
+    moments, because the mean is below that of noise around black (left), or the variance below that of shot noise
+    (right).
 
     Args:
         gain_dn_per_e: gain, DN/e-; by default that of the red pixels of the paper's Canon.
-        **keywords: black level, ranges, ... as `clip_table_figure` takes them.
+        **keywords: black level, ranges, ... of `clip_table_figure`.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019, Fig. 4.
     """
@@ -86,7 +86,7 @@ def _panel(
     axes.set_title(title, fontsize=10)
     axes.set_xlabel("mean of clipped counts above black / DN")
     axes.tick_params(labelsize=9)
-    # Drawn below the colours, so that it shows where there are none.
+    # Drawn below the colours, so that it shows only where there are none.
     axes.patch.set(facecolor="0.93", edgecolor="0.6", hatch="///")
     shading = axes.pcolormesh(x, y, values, cmap="viridis", shading="nearest", norm=norm, rasterized=True)
     lines = axes.contour(x, y, values, locator=locator, colors="white", linewidths=0.8)

@@ -1,6 +1,6 @@
-"""One page of HTML about a capture and what was found in it.
+"""One page of HTML about a capture and the results from it.
 
-May import all but the command line.
+May import everything but the command line.
 """
 
 from hsnoise.report.page import Found, check_path, page, write_report

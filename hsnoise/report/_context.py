@@ -1,8 +1,7 @@
-"""What the page says: words and numbers for the template, from what was found."""
+"""The page's content: words and numbers for the template, from a result."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
@@ -13,8 +12,8 @@ import numpy as np
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.types import unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
-from hsnoise.criticism.compare import FITS, nearer
-from hsnoise.criticism.improve import UNFINISHED
+from hsnoise.criticism.compare import nearer
+from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.criticism.story import together
 from hsnoise.fitting.result import FitResult, number, rounded
 from hsnoise.frames.stack import FrameStack
@@ -44,7 +43,7 @@ def context(
     files: Sequence[str],
     seed: int,
 ) -> dict[str, Any]:
-    """All that the template needs but figures."""
+    """Everything that the template needs, except figures."""
     diagnosis = found if isinstance(found, Diagnosis) else None
     story = found if isinstance(found, Story) else None
     if isinstance(found, Comparison):
@@ -57,7 +56,7 @@ def context(
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
         "conclusion": said,
         "light": LIGHTS[said.light],
-        "said": _apart(said.sentence),
+        "said": (said.head, said.rest),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
         "doubts": fit.doubts if isinstance(fit, FitResult) else (),
@@ -70,32 +69,24 @@ def context(
         "ranking": [] if diagnosis is None else ranking(diagnosis),
         "story": None if story is None else steps(story),
         "stacked": None if story is None else stacked(story),
-        "unfinished": story is not None and story.ended.startswith(UNFINISHED.partition(":")[0]),
+        "unfinished": story is not None and story.ending.why == Ended.UNFINISHED,
         "ended": "" if story is None else story.ended,
         "split": "" if story is None else story.split,
     }
 
 
 def conclusion(found: Comparison | Diagnosis | Story | FitResult, comparison: Comparison | None) -> Conclusion:
-    """The finding in one sentence, with the error of the model that a diagnosis is about."""
+    """The conclusion in one sentence; for a diagnosis, with the error of the model."""
     said = found.conclusion
     if not isinstance(found, Diagnosis) or comparison is None:
         return said
     error = f"error {number(comparison.error)}"
-    if found.verdict == "nothing missing" and comparison.error >= FITS:
+    if found.verdict != Verdict.NOTHING_MISSING:
+        return Conclusion(said.light, said.head, f"{error.capitalize()}, {YARDSTICK}.")
+    if not comparison.fits:
         text = f"No effect stands out, but the model does not fit these frames ({error}): is it a fit of this capture?"
         return Conclusion(Light.RED, text)
-    after = f" ({error})" if found.verdict == "nothing missing" else f"; {error}, {YARDSTICK}"
-    return Conclusion(said.light, f"{said.sentence.removesuffix('.')}{after}.")
-
-
-def _apart(sentence: str) -> tuple[str, str]:
-    """A conclusion as what is read first, up to its first full stop or semicolon, and the rest."""
-    found = re.match(r"(.+?[.;]) (.+)", sentence)
-    if found is None:
-        return sentence, ""
-    first, rest = found.groups()
-    return first.replace(";", "."), rest[0].upper() + rest[1:]
+    return Conclusion(said.light, f"Nothing significant is missing ({error}).")
 
 
 def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
@@ -114,7 +105,7 @@ def capture(stack: FrameStack, files: Sequence[str]) -> dict[str, Any]:
 
 
 def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
-    """Rows of the parameter table, with what was chosen for effects; "error" only for a FitResult."""
+    """Rows of the parameter table, with the effects' settings; "error" only for a FitResult."""
     model = fit if isinstance(fit, NoiseModel) else fit.params
     settings = [(e.name, n, v) for e in model.effects for n, v in e.settings().items() if v is not None]
     chosen = [
@@ -130,7 +121,7 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
 
 
 def stacked(story: Story) -> dict[str, Any]:
-    """A bar for each step of a story, its parts the groups of statistics; positions in percent of the width."""
+    """A bar for each step of a story, with a part per group of statistics; positions in percent of the width."""
     bars = [parts_of(step.comparison) for step in story.steps]
     longest = max(1.0, *(sum(part.decades for part in parts) for parts in bars))
     names = [story.start, *(f"+ {step.added}" for step in story.steps[1:])]
@@ -160,7 +151,7 @@ def _part(part: Part, longest: float) -> dict[str, Any]:
 def bars(comparison: Comparison) -> dict[str, Any]:
     """Misfit of each group as a bar on a logarithmic scale, worst first; positions in percent of the width.
 
-    `own`: misfit that the worst group takes on the model's own samples.
+    `own`: misfit of the worst group on the model's own samples.
     """
     groups = sorted(comparison.groups.items(), key=lambda item: -item[1])
     own = comparison.own_misfit
@@ -180,14 +171,14 @@ def bars(comparison: Comparison) -> dict[str, Any]:
 
 
 def _along(value: float, low: float, high: float) -> str:
-    """The place of a value on a logarithmic scale, in percent of the width."""
+    """The position of a value on a logarithmic scale, in percent of the width."""
     return f"{100 * max(np.log(max(value, low) / low) / np.log(high / low), 0.005):.2f}%"
 
 
 def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Rows of the ranking table; `width` of the bar of a score, in percent of the width."""
+    """Rows of the ranking table; `width` is the length of a score's bar in percent."""
     shown = diagnosis.ranking[:MOST_CANDIDATES]
-    largest = max(10.0, *(c.score for c in shown))  # what chance gives makes no long bar
+    largest = max(10.0, *(c.score for c in shown))  # keeps bars of chance scores short
     return [
         {
             "name": c.name,
@@ -202,7 +193,7 @@ def ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def steps(story: Story) -> list[dict[str, Any]]:
-    """The additions of a story: what, why, the error before and after, what moved."""
+    """The steps of a story: the added effect, why, the error before and after, changed parameters."""
     return [
         {
             "added": after.added,

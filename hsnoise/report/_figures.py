@@ -1,4 +1,4 @@
-"""Figures of the page, inline: SVG that takes the colours of the page; and the page around them."""
+"""The page's inline figures, as SVG in the colours of the page, and the rendered page."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from hsnoise.report._measured import Middle, Shown
 from hsnoise.report._pictures import pictures
 from hsnoise.statistics.structure import SHORT
 
-SIZE_IN = (4.4, 3.1)  # of a panel: its letters can be read at the width of a phone
+SIZE_IN = (4.4, 3.1)  # of a panel: readable at the width of a phone
 LINES = ("row", "column")
-# Of all figures: measured is black and becomes the page's text colour, the others are colours that the page sets.
+# In all figures: measured is black, which becomes the page's text colour; the page sets the other colours.
 MEASURED, MODEL, BEFORE, BAND = "#000000", "#6a3d9a", "#777777", "#b9a5d3"
 PAGE_COLOURS = {MEASURED: "currentColor", MODEL: "var(--model)", BEFORE: "var(--before)", BAND: "var(--band)"}
 GRID = "#e6e6e6"  # as in the plots' style
 
 
 def breakable(name: str) -> Markup:
-    """A parameter's name that a narrow column may break after its dots and underscores, not within a word."""
+    """A parameter's name that narrow columns may break after dots and underscores, not within words."""
     return Markup(str(escape(name)).replace(".", ".<wbr>").replace("_", "_<wbr>"))
 
 
@@ -50,7 +50,7 @@ def render(
 ) -> str:
     """The page: `context` (see `_context`) and the figures in the template."""
     comparison = context["comparison"]
-    # Where the model fails: what is missing from short exposures may drown in the dark current of long ones.
+    # Where the model fails: effects missing from short exposures may drown in the dark current of long ones.
     shortest = comparison is not None and any(SHORT in sentence for sentence in comparison.worst[:1])
     model = fit.params if isinstance(fit, FitResult) else fit
     models = {"first model": found.steps[0].fit.params} if isinstance(found, Story) and len(found.steps) > 1 else {}
@@ -78,12 +78,12 @@ def render(
 
 
 def inline(figures: dict[str, Figure], prefix: str) -> list[Markup]:
-    """Figures by their names as elements of the page."""
+    """Figures, by name, as elements of the page."""
     return [svg(figure, f"{prefix}{i}", name) for i, (name, figure) in enumerate(figures.items())]
 
 
 def panels(at: Shown) -> dict[str, Figure]:
-    """Counts, spectra of rows and columns, and frame means of each colour."""
+    """Counts, spectra of rows and columns, and frame means, for each colour."""
     made = {f"{NAMES[c]}, counts": histogram(at, c) for c in at.channels}
     made |= {f"{NAMES[c]}, {LINES[axis]} spectrum": spectrum(at, c, axis) for axis in (0, 1) for c in at.channels}
     if len(at.measured) > 1:
@@ -92,7 +92,7 @@ def panels(at: Shown) -> dict[str, Figure]:
 
 
 def budget_panels(near: Middle, models: list[str]) -> dict[str, Figure]:
-    """The noise budget of each exposure and colour, measured and of the models; none where all are of one frame."""
+    """The noise budget of each exposure and colour, measured and of the models; none if all are single frames."""
     budgets = near.budgets
     if not budgets:
         return {}
@@ -109,7 +109,7 @@ def _kind_of(row: BudgetRow) -> str:
 
 
 def budget_panel(rows: tuple[BudgetRow, ...], models: list[str], limits: tuple[float, float]) -> Figure:
-    """Components of the noise of an exposure and colour: measured (dots), and of models (hollow); arrows: limits."""
+    """Noise components of an exposure and colour: measured (dots) and models (hollow); arrows: upper limits."""
     figure, axes = _panel(_kind_of(rows[0]), "standard deviation / DN", "")
     looks = {"measured": ("o", MEASURED, MEASURED, 30), "first model": ("D", "none", BEFORE, 34)}
     for name, row in zip(("measured", *models), rows, strict=True):
@@ -153,7 +153,7 @@ def histogram(at: Shown, channel: str) -> Figure:
 
 
 def spectrum(at: Shown, channel: str, axis: int) -> Figure:
-    """Power of the mean rows or columns of a colour: measured (points), and of the draws (line, band: all draws)."""
+    """Power of a colour's row or column means: measured (points) and draws (line: mean, band: range)."""
     k, power = _measured.line_spectrum(at.measured, at.cfa, channel, axis)
     drawn = np.stack([_measured.line_spectrum(one, at.cfa, channel, axis)[1] for one in at.drawn])
     name = LINES[axis]
@@ -169,7 +169,7 @@ def spectrum(at: Shown, channel: str, axis: int) -> Figure:
 
 
 def frame_means(at: Shown, channel: str) -> Figure:
-    """Mean of each frame of a colour over the mean of all: measured (points), and of all draws (lines)."""
+    """Mean of each frame of a colour minus the mean of all: measured (points) and draws (lines)."""
     means = [_measured.frame_means(one, at.cfa, channel) for one in (at.measured, *at.drawn)]
     figure, axes = _panel(f"{NAMES[channel]}, frames", "frame number", "frame mean - mean of all / DN")
     number = np.arange(len(means[0]))
@@ -182,7 +182,7 @@ def frame_means(at: Shown, channel: str) -> Figure:
 
 
 def _few_decades(axis: Axis, low: float, high: float) -> None:
-    """Plain numbers along a logarithmic axis, between the decades too if there are not even two."""
+    """Plain numbers on a logarithmic axis; also between decades if it spans fewer than two."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
@@ -205,7 +205,7 @@ def _legend(figure: Figure, axes: Axes) -> Figure:
 def svg(figure: Figure, prefix: str, label: str) -> Markup:
     """A figure as an element of the page: black becomes the colour of its text, ids begin with `prefix`."""
     buffer = io.StringIO()
-    # The salt makes the same figure the same text every time.
+    # The salt makes the output reproducible.
     with matplotlib.rc_context({"svg.hashsalt": "hsnoise"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()

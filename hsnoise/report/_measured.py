@@ -1,4 +1,4 @@
-"""A capture beside draws of the models, as numbers: frames, spectra of lines, histograms, noise budgets."""
+"""A capture beside draws of the models, as numbers: frames, spectra of rows and columns, histograms, budgets."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from hsnoise.criticism.budget import NoiseBudget, budget
 from hsnoise.frames.bayer import channel_pixels, channel_planes
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_fits, darks_of, draw_capture, middle_of
+from hsnoise.simulation.draws import check_fits, draw_capture
+from hsnoise.simulation.portion import Portion, middle_of
 
 DRAWS = 4
-SEED_APART = 9000  # the draws shown are none of those that the comparison was made with
+SEED_APART = 9000  # so that the draws shown differ from those of the comparison
 MOST_FRAMES = 16  # of the exposure shown
 BANDS_PER_OCTAVE = 4
 CROP = (240, 320)
-CORE, REACH = (2.0, 98.0), 3.0  # bins reach so many widths of the core to either side of it
+CORE, REACH = (2.0, 98.0), 3.0  # percentiles of the core; bins extend this many core widths to either side
 MOST_BINS = 90
 
 
 @dataclass(frozen=True)
 class Shown:
-    """One dark exposure: frames [frame, row, column] measured, and of each draw of the model."""
+    """One dark exposure: frames [frame, row, column], measured and of each draw of the model."""
 
     exposure_s: float
     cfa: str
@@ -37,34 +38,34 @@ class Shown:
 
 @dataclass(frozen=True)
 class Middle:
-    """The middle of a few exposures, the dark one shown first, as measured and as each of some models draws it."""
+    """The middle of a few exposures, first the dark one shown, measured and drawn from each model."""
 
     measured: FrameStack
     drawn: tuple[FrameStack, ...]
 
     @property
     def frames(self) -> list[np.ndarray]:
-        """The first dark frame [row, column], at most `CROP`: measured, and of each model."""
+        """The first dark frame [row, column], at most `CROP`: measured and of each model."""
         return [crop(stack.frame(0, 0)) for stack in (self.measured, *self.drawn)]
 
     @property
     def budgets(self) -> list[NoiseBudget]:
-        """Measured, and of each model; none where no exposure has two frames."""
+        """Noise budgets, measured and of each model; none if no exposure has two frames."""
         if max(self.measured.n_frames) < 2:
             return []
         return in_threads(budget, [self.measured, *self.drawn])
 
 
 def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = False) -> Shown:
-    """The longest (shortest) dark exposure of `stack`, and as many draws of it as scatter needs.
+    """The longest (shortest) dark exposure of `stack`, and enough draws of it to show their scatter.
 
     Raises:
-        TypeError, ValueError: model and stack do not fit together, no darks.
+        TypeError, ValueError: model and stack do not match, or there are no darks.
     """
     check_fits(model, stack)
     darks = _darks(stack)
     first = int(np.argmin(darks.exposure_s) if shortest else np.argmax(darks.exposure_s))
-    # A stack of a single frame would be refused.
+    # FrameStack rejects a single frame.
     chosen = [first] if darks.n_frames[first] > 1 else [first, *(i for i in range(darks.n_exposures) if i != first)]
     part = darks.select(exposures=chosen)
     seeds = [seed + SEED_APART + i for i in range(DRAWS)]
@@ -73,14 +74,14 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = F
 
 
 def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shortest: bool = False) -> Middle:
-    """The dark exposure that is shown, the brightest flat, and of a sensor without colours the other extreme, too."""
+    """The dark exposure that is shown, the brightest flat, and, for mono sensors, the other extreme dark."""
     measured = _middle(stack, shortest)
     return Middle(measured, tuple(in_threads(lambda model: draw_capture(seed + SEED_APART, model, measured), models)))
 
 
-@lru_cache(maxsize=1)  # a page is written after each step of a story, and files are slow to read
+@lru_cache(maxsize=1)  # a story writes a page after each step, and reading files is slow
 def _darks(stack: FrameStack) -> FrameStack:
-    return darks_of(stack).select(frames=slice(0, MOST_FRAMES))
+    return Portion.of(stack).darks.frames.select(frames=slice(0, MOST_FRAMES))
 
 
 @lru_cache(maxsize=2)
@@ -101,7 +102,7 @@ def _frames(stack: FrameStack, exposure: int = 0) -> np.ndarray:
 
 
 def crop(frame: np.ndarray) -> np.ndarray:
-    """The middle of a frame [row, column], at most `CROP`, where its first pixel has the colour of the frame's."""
+    """The middle of a frame [row, column], at most `CROP`, with the frame's Bayer order."""
     parts = []
     for size, most in zip(frame.shape, CROP, strict=True):
         start = max(0, (size - most) // 4 * 2)
@@ -110,12 +111,12 @@ def crop(frame: np.ndarray) -> np.ndarray:
 
 
 def line_spectrum(frames: np.ndarray, cfa: str, channel: str, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency (cycles per frame) and power (DN^2) of the mean lines of a colour, in bands of equal ratio.
+    """Frequency (cycles per frame) and power (DN^2) of a colour's row or column means, in bands of equal ratio.
 
     Args:
         frames: [frame, row, column], DN; axis: 0 for rows, 1 for columns.
 
-    Power is that of the periodogram, averaged over the frames; its mean over all frequencies is the variance of lines.
+    Power is the periodogram averaged over frames; its mean over all frequencies is the variance of the means.
     """
     if axis == 1:
         frames = frames.transpose(0, 2, 1)
@@ -135,7 +136,7 @@ def line_spectrum(frames: np.ndarray, cfa: str, channel: str, axis: int) -> tupl
 
 
 def histogram_edges(at: Shown, channel: str) -> np.ndarray:
-    """Edges of bins of whole counts around the core of what was measured and drawn; the outermost hold the rest."""
+    """Edges of bins of whole counts around the core of measured and drawn counts; the outermost hold the rest."""
     pixels = np.concatenate([_pixels(frames[:1], at.cfa, channel) for frames in (at.measured, *at.drawn)])
     low, high = np.percentile(pixels, CORE)
     reach = REACH * max(high - low, 1.0)
@@ -145,13 +146,13 @@ def histogram_edges(at: Shown, channel: str) -> np.ndarray:
 
 
 def frame_means(frames: np.ndarray, cfa: str, channel: str) -> np.ndarray:
-    """Mean of each frame of a colour less the mean of all, DN [frame]."""
+    """Mean of each frame of a colour minus the mean of all, DN [frame]."""
     means = np.array([channel_pixels(frame, cfa, channel).mean() for frame in frames])
     return means - means.mean()
 
 
 def share(frames: np.ndarray, cfa: str, channel: str, edges: np.ndarray) -> np.ndarray:
-    """Share of the pixels of a colour per DN in each bin."""
+    """Share of a colour's pixels per DN in each bin."""
     pixels = np.clip(_pixels(frames, cfa, channel), edges[0] + 0.25, edges[-1] - 0.25)
     counts, _ = np.histogram(pixels, edges)
     return counts / pixels.size / np.diff(edges)

@@ -1,4 +1,4 @@
-"""Frames of the page: grey pictures at one stretch, each with the means of its rows and of its columns."""
+"""Frames on the page: grey pictures with a common stretch, each with the means of its rows and columns."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from PIL import Image
 
 from hsnoise._core.types import cfa_tile
 
-STRETCH = (0.5, 99.5)  # percentiles of the measured frame that are black and white
-REACH = 1.1  # of the largest mean of a line, at the ends of the strips
+STRETCH = (0.5, 99.5)  # percentiles of the measured frame shown as black and white
+REACH = 1.1  # of the largest row or column mean, at the ends of the strips
 
 
 def pictures(frames: Sequence[np.ndarray], cfa: str, whole: tuple[int, int]) -> dict[str, Any]:
-    """Frames [row, column] of one exposure as pictures with their strips; limits and part in words.
+    """Frames [row, column] of one exposure as pictures with strips; limits and region in words.
 
-    Of each colour its median in the first frame is taken off all of them, so that noise is seen, not the mosaic.
+    Each colour's median in the first frame is subtracted from all frames, to show noise instead of the mosaic.
     """
     tile = cfa_tile(cfa)
     level = np.zeros(frames[0].shape)
@@ -51,7 +51,7 @@ def pictures(frames: Sequence[np.ndarray], cfa: str, whole: tuple[int, int]) -> 
 
 
 def _lines(frame: np.ndarray, axis: int, step: int) -> np.ndarray:
-    """Means of rows (0) or columns (1) less that of all with the same colours, DN."""
+    """Means of rows (0) or columns (1) minus the mean of all with the same colours, DN."""
     means = frame.mean(1 - axis)
     for first in range(step):
         means[first::step] -= means[first::step].mean()
@@ -59,7 +59,7 @@ def _lines(frame: np.ndarray, axis: int, step: int) -> np.ndarray:
 
 
 def _strip(means: np.ndarray, largest: float, upright: bool) -> Markup:
-    """A curve as wide, or as high, as the picture beside it; stretched to its place by the page."""
+    """A curve as wide, or as high, as the picture beside it; the page stretches it to fit."""
     along = np.arange(len(means)) + 0.5
     across = 50 + 50 * means / largest
     points = zip(across, along, strict=True) if upright else zip(along, 100 - across, strict=True)
@@ -73,7 +73,7 @@ def _strip(means: np.ndarray, largest: float, upright: bool) -> Markup:
 
 
 def _png(grey: np.ndarray) -> str:
-    """A picture [row, column] of 0 (black) to 1 as the address of an inline image."""
+    """A picture [row, column] from 0 (black) to 1 as a data URL."""
     buffer = io.BytesIO()
     Image.fromarray(np.round(255 * grey).astype(np.uint8)).save(buffer, format="png", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,6 +1,6 @@
-"""One page of HTML about a capture and a model: what `fit`, `compare`, `diagnose` or `improve` found, with figures.
+"""One page of HTML on a capture and a model: the result of `fit`, `compare`, `diagnose` or `improve`, with figures.
 
-The page holds its figures and styles, asks no network for anything, and is written whole or not at all.
+The page contains its figures and styles, needs no network, and is written whole or not at all.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from hsnoise._core.naming import named
 from hsnoise._core.output import write_atomically
 from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.fitting.result import FitResult
@@ -25,15 +26,15 @@ def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None
 
     Args:
         path: ends in .html, in a folder that exists.
-        made: a folder that may not exist yet, because the caller makes it.
+        made: a folder that may not exist yet, because the caller will create it.
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
-        raise ValueError(f"report: expected a file ending in .html, got {path}")
+        raise ValueError(f"{named('report')}: expected a file ending in .html, got {path}")
     if path.is_dir():
-        raise ValueError(f"report: expected a file, but {path} is a folder")
+        raise ValueError(f"{named('report')}: expected a file, but {path} is a folder")
     if not path.parent.is_dir() and (made is None or path.parent.resolve() != Path(made).resolve()):
-        raise ValueError(f"report: there is no folder {path.parent}")
+        raise ValueError(f"{named('report')}: there is no folder {path.parent}")
 
 
 def page(
@@ -49,15 +50,15 @@ def page(
 
     Args:
         found: result of `hsnoise.compare`, `diagnose`, `improve` or `fit`.
-        stack: the capture that it is about; its dark frames are shown beside draws of the model.
+        stack: the capture; its dark frames are shown beside draws of the model.
         fit: the model that was compared or diagnosed, with standard errors if it is a FitResult; not for a Story
             or a fit, which have their own.
-        comparison: of that model, for a Diagnosis: its bars and worst statistics are left out without.
-        files: names of the files that the capture was read from.
-        seed: of the draws that are shown.
+        comparison: for a Diagnosis, the comparison of its model; without it, bars and worst statistics are left out.
+        files: names of the capture's files.
+        seed: seed of the draws that are shown.
 
     Raises:
-        TypeError, ValueError: no fit with a Comparison or Diagnosis, or one that does not fit the stack; no darks.
+        TypeError, ValueError: no fit with a Comparison or Diagnosis, or one that does not match the stack; no darks.
     """
     from hsnoise.report._context import context  # Jinja2 and matplotlib are slow to import
     from hsnoise.report._figures import render
@@ -73,8 +74,8 @@ def write_report(path: str | os.PathLike, found: Found, stack: FrameStack, **key
     """Write the page of `page(found, stack, **keywords)` to a file.
 
     Raises:
-        ValueError: a path that `check_path` refuses; TypeError, ValueError: see `page`.
-        OSError: the file cannot be written; one that exists is left as it was.
+        ValueError: a path that `check_path` rejects; TypeError, ValueError: see `page`.
+        OSError: the file cannot be written; an existing file is left as it was.
     """
     check_path(path)
     write_atomically(path, page(found, stack, **keywords).encode())

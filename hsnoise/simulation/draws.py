@@ -2,94 +2,34 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import lru_cache
 
 import jax
 import numpy as np
 
-from hsnoise._core.keys import named_key
-from hsnoise._core.types import cfa_tile
+from hsnoise._core.keys import key_of, named_key
+from hsnoise._core.naming import named, setting
+from hsnoise._core.types import RandomKey, cfa_tile
 from hsnoise.effects import Stage
-from hsnoise.frames.arguments import check_no_copies
-from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
-from hsnoise.statistics.structure import check_size
 
-MOST_PIXELS = 4_000_000  # of a capture that is drawn again and again
-LEAST_FRAMES, LEAST_COLUMNS = 8, 64
-MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
-FAR_OFF = 5.0  # deviations from which a statistic counts less
-FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
-
-
-def darks_of(stack: FrameStack) -> FrameStack:
-    """The dark exposures of a stack, cut as `part_of` does. Raises ValueError without darks."""
-    return part_of(stack, kinds=("dark",))
-
-
-def part_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> FrameStack:
-    """The exposures of a stack, in memory, cut to what can be drawn many times.
-
-    Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
-    darks, for frames that are copies, and for frames too small to tell rows from pixels.
-    """
-    check_size(stack)
-    if "dark" not in stack.kind:
-        raise ValueError("stack: expected dark frames, got flats only")
-    chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
-    rows, columns = stack.shape
-    per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(chosen) * rows * columns))
-    frames = sum(min(stack.n_frames[i], per_exposure) for i in chosen)
-    kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
-    first = 0
-    if kept < columns:
-        first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
-    end = min(first + kept, columns)
-    part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
-    counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
-    check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
-    # What depends on the place stays where it is on the sensor.
-    window = part.window or ((0, first, rows, columns) if end - first < columns else None)
-    return part.with_counts(counts, window)
-
-
-def middle_of(stack: FrameStack, kinds: tuple[str, ...] = ("dark", "flat")) -> FrameStack:
-    """The middle of a few frames of each exposure, nothing read: enough for a look at how pixels differ.
-
-    Raises ValueError where there is no exposure of these kinds.
-    """
-    chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
-    if not chosen:
-        raise ValueError(f"stack: expected {' or '.join(kinds)} frames, and there are none")
-    frames, rows, columns = MIDDLE
-    # What depends on the place stays where it is on the sensor.
-    whole = replaced(stack, window=stack.window or (0, 0, *stack.shape))
-    spans = [_middle(size, most) for size, most in zip(stack.shape, (rows, columns), strict=True)]
-    return whole.select(frames=slice(0, frames), exposures=chosen, rows=spans[0], columns=spans[1])
-
-
-def _middle(size: int, most: int) -> slice:
-    """At most `most` of a side, even at both ends."""
-    first = max((size - most) // 4 * 2, 0)
-    return slice(first, min(first + most, size))
 
 
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
     """Raise TypeError or ValueError, naming the argument, unless `model` can describe the sensor of `stack`."""
     if not isinstance(model, NoiseModel):
-        raise TypeError(f"{name}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
+        raise TypeError(f"{named(name)}: expected a NoiseModel (fit.params of a fit), got {type(model).__name__}")
     if (model.cfa, model.shutter) != (stack.cfa, stack.shutter):
         raise ValueError(
-            f"{name}: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter} (if its"
-            " files do not say so, give it cfa= and shutter=)"
+            f"{named(name)}: made for {model.cfa}, {model.shutter} shutter; the stack is {stack.cfa}, {stack.shutter}"
+            f" (if its files do not say so, give it {setting('cfa')} and {setting('shutter')})"
         )
     if "adc" not in model:
-        raise ValueError(f"{name}: expected a model with the effect adc, which makes counts (DN)")
+        raise ValueError(f"{named(name)}: expected a model with the effect adc, which makes counts (DN)")
 
 
 def check_effects(model: NoiseModel, like: FrameStack) -> None:
@@ -126,9 +66,12 @@ def black_level_of(model: NoiseModel) -> np.ndarray:
     return np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(n)
 
 
-def draw_capture(seed: int, model: NoiseModel, like: FrameStack) -> FrameStack:
-    """A capture drawn from `model` as `like` was taken: one sensor, every frame new, flats in light as bright."""
-    key = jax.random.key(seed)
+def draw_capture(key: RandomKey | int, model: NoiseModel, like: FrameStack) -> FrameStack:
+    """A capture drawn from `model` as `like` was taken: one sensor, every frame new, flats in light as bright.
+
+    key: a random key, or its seed.
+    """
+    key = key_of("key", key)
     sensor_key = named_key(key, "sensor")
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
@@ -162,13 +105,3 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
         coefficients = np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T
         surface[r::step, c::step] = down @ coefficients @ across.T
     return surface
-
-
-def share_of_far(z: np.ndarray) -> np.ndarray:
-    """Square roots of Huber's weights of deviations z: what is far off counts less."""
-    return np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(z), 1e-12)))
-
-
-def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
-    """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`."""
-    return (dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS)

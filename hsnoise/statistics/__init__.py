@@ -1,4 +1,5 @@
-"""What a capture is compared by: statistics of its structure, the three-dimensional decomposition, single pixels.
+"""The statistics by which captures are compared: structure, three-dimensional decomposition, single pixels.
 
-The same for measured frames and draws of a model, of which nothing is known here. May import `_core` and `frames`.
+They treat measured frames and a model's draws alike and know nothing of models. May import `_core`, `frames` and, for
+what proposals of effects ask of a capture, `effects`.
 """

@@ -20,9 +20,9 @@ MOST_CODES = 1 << 16
 
 @dataclass(frozen=True)
 class Layout:
-    """What decides which statistics there are: never a count.
+    """Everything that determines which statistics exist; it never depends on the counts.
 
-    exposures: dark exposure groups in order of time; frames: how many of each are used; rows, columns: the part used.
+    exposures: dark exposure groups in order of time; frames: how many of each are used; rows, columns: the used part.
     """
 
     cfa: str
@@ -35,7 +35,7 @@ class Layout:
 
     @property
     def letters(self) -> tuple[str, ...]:
-        """Colour of each plane; planes are numbered along the rows of the 2x2 cell."""
+        """Colour of each plane; planes are numbered row by row in the 2x2 cell."""
         return ("mono",) if self.cfa == "mono" else tuple(self.cfa)
 
 
@@ -44,13 +44,13 @@ class Exposure:
     """Analysis of variance of the counts above black [plane, frame, row, column] of one exposure, DN.
 
     mean [plane], frame [plane, frame], row_frame [plane, frame, row], column_frame [plane, frame, column],
-    row [plane, row], column [plane, column], pixel [plane, row, column] (the static map) add up to the counts with a
-    residual. scale [plane, frame, row] is the spread of the residual in each row, from its mean absolute value (by
+    row [plane, row], column [plane, column], pixel [plane, row, column] (the static map) and a residual add up to the
+    counts. scale [plane, frame, row] is the spread of the residual in each row, from its mean absolute value (in the
     rms a cosmic hit would hide itself); residual [plane, frame, row, column] is divided by it, bounded is cut at +-5.
-    variance [plane] is that of the residual, DN^2. codes: first code and histogram of counts [code], a plane each.
+    variance [plane] is the residual's, DN^2. codes: first code and histogram of counts [code] of each plane.
 
-    With a single frame there is no difference between static and not: row_frame, column_frame and residual
-    hold what `row`, `column` and `pixel` hold.
+    A single frame cannot separate static from temporal: row_frame, column_frame and residual then equal row, column
+    and pixel.
     """
 
     mean: np.ndarray
@@ -73,18 +73,18 @@ class Exposure:
 
 
 def check_size(stack: FrameStack) -> None:
-    """Raise ValueError for frames too small to tell rows from pixels."""
+    """Raise ValueError for frames too small to separate rows from pixels."""
     if min(stack.shape) < SMALLEST:
         rows, columns = stack.shape
         raise ValueError(f"stack: expected frames of at least {SMALLEST} x {SMALLEST} pixels, got {rows} x {columns}")
 
 
 def layout_of(stack: FrameStack, kind: str = "dark") -> Layout:
-    """Which exposures of a kind, frames and pixels of a stack are used, and sentences on what is not."""
+    """The exposures of a kind, frames and pixels of a stack that are used, and sentences on what is skipped."""
     chosen = [i for i, one in enumerate(stack.kind) if one == kind]
     chosen.sort(key=lambda i: stack.exposure_s[i])
     if not chosen:
-        raise ValueError("structure: expected at least one dark exposure, got none; its statistics are of dark frames")
+        raise ValueError("structure: expected at least one dark exposure, got none; its statistics need dark frames")
     check_size(stack)
     rows, columns = _central(stack.shape)
     most = max(FEWEST_FRAMES, MOST_PIXELS // ((rows.stop - rows.start) * (columns.stop - columns.start)))
@@ -98,7 +98,7 @@ def layout_of(stack: FrameStack, kind: str = "dark") -> Layout:
 
 
 def _central(shape: tuple[int, int]) -> tuple[slice, slice]:
-    """The middle of a frame too large to use whole; starts and sizes keep Bayer cells and pairs of them."""
+    """The middle of a frame that is too large to use whole; starts and sizes keep pairs of Bayer cells intact."""
     shrink = min(1.0, np.sqrt(MOST_FRAME_PIXELS / (shape[0] * shape[1])))
     if shrink == 1.0:
         return slice(0, shape[0]), slice(0, shape[1])
@@ -155,7 +155,7 @@ def analyse(signal: np.ndarray, codes: tuple[tuple[int, np.ndarray], ...]) -> Ex
     dof = max(frames - 1, 1) * (rows - 1) * (columns - 1)
     variance = np.einsum("pfrc,pfrc->pfr", residual, residual).sum((1, 2), dtype=np.float64) / dof
     scale = np.abs(residual).mean(3) / np.float32(GAUSSIAN_ABS)
-    # A row without noise (gain 0, all clipped) must not blow up what little it has.
+    # A row without noise (gain 0, all clipped) must not be amplified.
     scale = np.maximum(scale, 0.05 * scale.mean((1, 2), keepdims=True) + np.float32(1e-3))
     residual /= scale[..., None]
     return Exposure(

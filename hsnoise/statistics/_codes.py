@@ -1,4 +1,4 @@
-"""Which codes a converter uses: the digital gain that left gaps between them."""
+"""The codes that a converter uses: finding a digital gain from the gaps between them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from hsnoise.frames.stack import FrameStack
 
 LEAST_STEP, MOST_STEP = 1.05, 4.0
-TAILS = 1e-3  # share of the counts, at either end, that is not looked at
-INSIDE, ON_COMB = 0.999, 0.94  # of the counts in the middle that lie near and on the comb
+TAILS = 1e-3  # share of the counts at either end that is ignored
+INSIDE, ON_COMB = 0.999, 0.94  # shares of the central counts that must lie near and on the comb
 FEWEST_CODES = 8
 FINENESS = 32  # steps tried for a shift of the last code by one
-TIES = 0.02  # k g beyond half a code: how halves are rounded is not known
-LARGEST_DENOMINATOR = 20  # of a digital gain that somebody chose
+TIES = 0.02  # tolerance of k g about half a code: how halves are rounded is unknown
+LARGEST_DENOMINATOR = 20  # of a digital gain that a person chose
 BLOCK, MOST_WORK = 4096, 200_000_000
 
 
 def code_step(stack: FrameStack) -> float | None:
-    """Digital gain g whose codes round(k g), k = 0, 1, ..., hold the counts of the darks; None if there is none.
+    """Digital gain g whose codes round(k g), k = 0, 1, ..., contain the counts of the darks; None if there is none.
 
-    From 1.05 to 4, if some codes between those that occur are missing; of several the largest simple fraction.
+    From 1.05 to 4, if codes between those that occur are missing. Of several, the largest simple fraction is returned.
     """
     histogram = np.zeros(1 << 16, np.int64)
     for i, kind in enumerate(stack.kind):
@@ -44,13 +44,13 @@ def code_step(stack: FrameStack) -> float | None:
         g = _simplest(float(run[0]), float(run[-1]), 1 / (FINENESS * high))
         if _on_comb(codes, weight, float(g)) >= ON_COMB * weight.sum():
             found.append(g)
-    # Larger is fewer codes, all of which occur. Behind a black level gains that differ by whole turns are alike: one
-    # that somebody chose is likelier.
+    # A larger gain has fewer codes, all of which occur. After a black level, gains that differ by whole turns look
+    # alike: a simple fraction is likelier to have been chosen.
     return float(max(found, key=lambda g: (g.denominator <= LARGEST_DENOMINATOR, g))) if found else None
 
 
 def _simplest(low: float, high: float, apart: float) -> Fraction:
-    """The middle of steps low..high, tried `apart`, or a fraction between that is likelier to have been chosen."""
+    """The simplest fraction between steps low..high (tried `apart`), or else their middle."""
     simple = Fraction((low + high) / 2).limit_denominator(LARGEST_DENOMINATOR)
     return simple if low - apart < simple < high + apart else Fraction((low + high) / 2)
 
@@ -62,6 +62,6 @@ def _near_comb(codes: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _on_comb(codes: np.ndarray, weight: np.ndarray, g: float) -> int:
-    """Counts whose code is a k g, halves rounded to even numbers or up, whichever holds more."""
+    """Number of counts whose code is a k g, with halves rounded to even or up, whichever holds more counts."""
     multiple = np.rint(codes / g) * g
     return max(int(weight[rounded == codes].sum()) for rounded in (np.rint(multiple), np.floor(multiple + 0.5)))

@@ -1,9 +1,9 @@
-"""Statistics of rows and columns of one exposure: their variances, colours, scales, spectra."""
+"""Statistics of the rows and columns of one exposure: variances, colours, scales, spectra."""
 
 from __future__ import annotations
 
 import numpy as np
-import scipy  # its parts are imported when they are used
+import scipy  # its submodules are imported on first use
 
 from hsnoise.statistics._anova import Exposure
 from hsnoise.statistics._sheet import ABS_VARIANCE, Sheet, correlation, fisher, log_ratio
@@ -13,11 +13,11 @@ HAAR_LEVELS = 6
 SAME_ROW = ((0, 1), (2, 3))
 SAME_COLUMN = ((0, 2), (1, 3))
 TINY = 1e-6
-WHITENED_FROM = 2  # the lowest frequencies of a periodogram carry trends, not lines
+WHITENED_FROM = 2  # lower frequencies of a periodogram carry trends, not spectral lines
 
 
 def variances(sheet: Sheet, x: Exposure) -> None:
-    """Log ratios of the mean squares of the analysis of variance, each the residual variance under white noise."""
+    """Log ratios of the mean squares of the analysis of variance; white noise makes all equal the residual variance."""
     planes, frames, rows, columns = x.shape
     dof = max(frames - 1, 1)
     row_frame = columns * _power(x.row_frame) / (dof * (rows - 1))
@@ -44,7 +44,7 @@ def _power(x: np.ndarray) -> np.ndarray:
 
 
 def colours(sheet: Sheet, x: Exposure) -> None:
-    """Correlations of rows and columns between colours and with their neighbours in space and time."""
+    """Correlations of rows and columns between colours, and with their neighbours in space and time."""
     planes, frames, rows, columns = x.shape
     n_rows, n_columns = max(frames - 1, 1) * rows, max(frames - 1, 1) * columns
     labels: dict[str, list[tuple[int, int]]] = {}
@@ -75,10 +75,10 @@ def colours(sheet: Sheet, x: Exposure) -> None:
 
 
 def _next(moving: np.ndarray, axis: int) -> np.ndarray:
-    """artanh of the correlation of neighbours along an axis of x [plane, frame, line], of mean 0 for white noise."""
+    """artanh of the correlation of neighbours along an axis of x [plane, frame, row or column], 0 for white noise."""
     n = moving.shape[axis]
     after, before = (np.take(moving, range(*ends), axis) for ends in ((1, n), (n - 1,)))
-    # What sums to zero over n has correlation -1/(n - 1).
+    # n white numbers that sum to zero have correlation -1/(n - 1).
     return correlation(after, before, (1, 2)) + 1 / (n - 1)
 
 
@@ -87,7 +87,7 @@ def _next_line(line: str, planes: int) -> str:
 
 
 def scales(sheet: Sheet, x: Exposure) -> None:
-    """Static profiles by scale and parity, against what the frames' fluctuations leave in their mean."""
+    """Static profiles by scale and parity, relative to what the frames' fluctuations leave in their mean."""
     if x.shape[1] == 1:
         return
     for group, profile, moving in (
@@ -109,7 +109,7 @@ def scales(sheet: Sheet, x: Exposure) -> None:
 
 
 def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
-    """Whether the noise of single rows differs from frame to frame, and that of neighbours together (interference)."""
+    """Whether rows change their noise from frame to frame, and neighbours change together (interference)."""
     planes, frames, rows, columns = x.shape
     spread = np.log(x.scale)
     spread = (spread - spread.mean((1, 2), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
@@ -119,7 +119,7 @@ def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
 
 
 def _haar(profile: np.ndarray) -> list[np.ndarray]:
-    """Mean squares of steps between neighbouring blocks of 1, 2, 4 ... lines of a profile [..., n]; alike if white."""
+    """Mean squares of steps between neighbouring blocks of 1, 2, 4 ... values of a profile [..., n]; equal if white."""
     n = profile.shape[-1]
     total = np.zeros((*profile.shape[:-1], n + 1))
     np.cumsum(profile, -1, out=total[..., 1:])
@@ -134,19 +134,19 @@ def _haar(profile: np.ndarray) -> list[np.ndarray]:
 
 
 def _parity(profile: np.ndarray, noise: np.ndarray) -> float:
-    """|contrast| of even and odd lines of a profile [plane, line], common to all planes, in its standard errors."""
+    """|contrast| of even and odd rows (columns) of a profile [plane, n] in standard errors, all planes together."""
     signs = 1.0 - 2.0 * (np.arange(profile.shape[1]) % 2)
     contrast = (profile @ signs) / np.sqrt(profile.shape[1] * (noise + TINY))
     return abs(contrast.sum()) / np.sqrt(len(profile))
 
 
 def cosines(n: int) -> np.ndarray:
-    """The three slowest cosines [3, n], orthonormal, without a mean."""
+    """The three slowest cosines [3, n], orthonormal, of mean 0."""
     return np.sqrt(2 / n) * np.cos(np.pi * np.outer(np.arange(1, 4), np.arange(n) + 0.5) / n)
 
 
 def spectra(sheet: Sheet, x: Exposure) -> None:
-    """Spectra over rows and columns of what is new in each frame: shape, and coherence of the colours of a line."""
+    """Spectra over rows and columns of what is new in each frame: shape, and coherence of the colours in one row."""
     planes, frames, rows, columns = x.shape
     for group, moving, pairs in (
         ("row spectrum", x.row_frame, SAME_ROW),
@@ -169,7 +169,7 @@ def spectra(sheet: Sheet, x: Exposure) -> None:
 
 
 def periodograms(x: Exposure) -> dict[str, np.ndarray]:
-    """Whitened periodograms over the lines of the whole sensor (colours mixed): row and column, moving and static."""
+    """Whitened periodograms over the rows and columns of the whole sensor (colours mixed), moving and static."""
     step = 1 if x.shape[0] == 1 else 2
     frames, rows, columns = x.shape[1:]
     row = x.row_frame.reshape(step, step, frames, rows).mean(1).transpose(1, 2, 0).reshape(frames, -1)
@@ -179,7 +179,7 @@ def periodograms(x: Exposure) -> dict[str, np.ndarray]:
 
 
 def static_profiles(x: Exposure) -> dict[str, np.ndarray]:
-    """Mean of each row and column of the whole sensor (colours mixed) over the frames, [1, line]; none of one frame."""
+    """Means over frames of the sensor's rows and columns (colours mixed), [1, n] each; empty for a single frame."""
     step = 1 if x.shape[0] == 1 else 2
     _, frames, rows, columns = x.shape
     if frames == 1:
@@ -190,17 +190,17 @@ def static_profiles(x: Exposure) -> dict[str, np.ndarray]:
 
 
 def strongest_share(profile: np.ndarray) -> float:
-    """Log of the power of the two neighbouring frequencies that have most of a profile [1, line], over the mean.
+    """Log of the power of the strongest pair of neighbouring frequencies of a profile [1, n], over the mean power.
 
-    A pattern of independent lines spreads over all frequencies; a period, a ramp or a shape does not. A line between
-    two frequencies of the transform shares its power between them.
+    Independent rows spread over all frequencies; a period, a ramp or a shape does not. A spectral line between two
+    frequencies of the transform shares its power between them.
     """
     power = np.square(np.abs(np.fft.rfft(profile[0])))[1:]
     return float(log_ratio((power[1:] + power[:-1]).max(), power.mean()))
 
 
 def _whitened(series: np.ndarray) -> np.ndarray:
-    """Periodogram of series [frame, n], averaged over frames, over a power law: about 1 for any 1/f noise."""
+    """Periodogram of series [frame, n], averaged over frames and divided by a power law: about 1 for any 1/f noise."""
     power = np.square(np.abs(np.fft.rfft(series))).mean(0)[1 + WHITENED_FROM :] + 1e-12
     frequency = np.log(np.arange(len(power)) + 1.0 + WHITENED_FROM)
     slope, offset = np.polyfit(frequency, np.log(power), 1)
@@ -208,7 +208,7 @@ def _whitened(series: np.ndarray) -> np.ndarray:
 
 
 def peak(periodogram: np.ndarray) -> float:
-    """Log of the largest value over its surroundings (a running median), which a 1/f rise does not move."""
+    """Log of the largest value over a running median around it, which a 1/f rise does not move."""
     width = min(31, len(periodogram) // 4 * 2 + 1)
     return float(
         log_ratio(np.max(periodogram / (scipy.ndimage.median_filter(periodogram, width, mode="reflect") + 1e-12)), 1.0)
@@ -216,10 +216,10 @@ def peak(periodogram: np.ndarray) -> float:
 
 
 def strongest_line(height: np.ndarray, n: int) -> tuple[float, float]:
-    """The highest of a periodogram about 1 of n sensor rows (columns), and its frequency, cycles each."""
+    """Height and frequency (cycles per row or column) of the highest peak of a whitened periodogram of n of them."""
     i = int(np.argmax(height))
     around = np.sqrt(np.maximum(np.pad(height, 1, constant_values=1.0)[i : i + 3] - 1, 0))
-    # A line between two frequencies of the transform has amplitudes there as its distances from them.
+    # The amplitudes at the two nearest frequencies of the transform give the line's distance from each.
     left, right = around[[0, 2]] / max(around[1] + max(around[0], around[2]), 1e-12)
     offset = right if right > left else -left
     return float(height[i]), float(min((i + 1 + WHITENED_FROM + offset) / n, 0.5))

@@ -44,18 +44,18 @@ def _histogram_shape(low: int, counts: np.ndarray) -> tuple[float, float]:
     below = np.concatenate([[0.0], cumulative])
     q05, q50, q95 = np.interp((0.05, 0.5, 0.95), below, np.arange(len(below)))
     skewness = (q95 + q05 - 2 * q50) / max(q95 - q05, 1e-6)
-    # The codes between the far quantiles; code 0 holds all that is clipped there.
+    # The codes between the outer quantiles; code 0 also holds all clipped counts.
     first, last = max(int(q05), 1 - low), int(q95) + 1
     some = counts[first:last].astype(np.float64)
     if len(some) < len(FOURTH_DIFFERENCE) or some.mean() < FEWEST_PER_CODE:
         return float(skewness), 0.0
-    # Square roots have variance 1 whatever the expected number; a fourth difference does not see a smooth law.
+    # Square roots have the same variance for any expected number; fourth differences ignore a smooth distribution.
     rough = np.convolve(2 * np.sqrt(some + 0.375), FOURTH_DIFFERENCE, "valid")
     return float(skewness), float(np.log(1 + np.mean(rough**2) / (FOURTH_DIFFERENCE**2).sum()))
 
 
 def _share_at_ends(low: int, counts: np.ndarray, white_level: float | None) -> tuple[float, float]:
-    """arcsin of the square root of the share of counts at zero and at the white level."""
+    """arcsin of the square root of the shares of counts at zero and at the white level."""
     n = counts.sum()
     zero = counts[0] if low == 0 else 0
     white = 0 if white_level is None else counts[max(int(white_level) - low, 0) :].sum()
@@ -81,11 +81,11 @@ def lags(sheet: Sheet, x: Exposure) -> None:
     error = 1 / np.sqrt(planes * rows * columns)
     for lag in STATIC_LAGS:
         value = fisher(_lag_product(static, lag) / power + _sum_to_zero(x, lag))
-        sheet.add("static pixels", f"map, {lag[0]} rows {lag[1]} columns away", value, error)
+        sheet.add("static pixels", f"map, {lag[0]} rows {lag[1]} columns away", value, error, of_map=True)
 
 
 def _sum_to_zero(x: Exposure, lag: tuple[int, int]) -> float:
-    """Minus the correlation of white noise at a lag along a row or column of one colour, whose sum is zero."""
+    """Minus the correlation, at a lag along a row or column of one colour, of white noise whose sum is zero."""
     step = 1 if x.shape[0] == 1 else 2
     if lag[0] % step or lag[1] % step or all(lag):
         return 0.0
@@ -114,7 +114,7 @@ def static_map(x: Exposure) -> np.ndarray:
 
 
 def tails(sheet: Sheet, x: Exposure) -> None:
-    """Shape of the residual and, of the static map, how many pixels lie far out."""
+    """Shape of the residual, and the numbers of outlying pixels of the static map."""
     n = max(x.shape[1] - 1, 1) * x.shape[2] * x.shape[3]
     square = x.bounded * x.bounded
     second = square.mean((2, 3)).mean(1, dtype=np.float64)
@@ -123,33 +123,33 @@ def tails(sheet: Sheet, x: Exposure) -> None:
     second = np.maximum(second, 1e-6)
     sheet.add_colours("tails", "skewness", third / second**1.5, np.sqrt(6 / n))
     sheet.add_colours("tails", "log kurtosis", np.log((fourth / second**2 + 0.01) / 3), np.sqrt(24 / n) / 3)
-    # Few values lie far out: look at those alone.
+    # Few values lie far out: count only among those.
     far = x.residual[np.abs(x.bounded) >= min(map(abs, TAILS))]
     _count_tails(sheet, "tails", "residuals", far)
     if x.shape[1] > 1:
         spread = np.abs(x.pixel).mean((1, 2), keepdims=True) * np.float32(np.sqrt(np.pi / 2)) + np.float32(1e-6)
         static = x.pixel / spread
-        _count_tails(sheet, "static pixels", "pixels of the map", static)
+        _count_tails(sheet, "static pixels", "pixels of the map", static, of_map=True)
         bounded = np.clip(static, -BOUND, BOUND)
         square = bounded * bounded
         kurtosis = (square * square).mean((1, 2)) / np.maximum(square.mean((1, 2)) ** 2, 1e-6)
         error = np.sqrt(24 / x.pixel.size) / 3
-        sheet.add("static pixels", "log kurtosis of the map", np.log((kurtosis + 0.01) / 3), error)
+        sheet.add("static pixels", "log kurtosis of the map", np.log((kurtosis + 0.01) / 3), error, of_map=True)
 
 
-def _count_tails(sheet: Sheet, group: str, what: str, values: np.ndarray) -> None:
+def _count_tails(sheet: Sheet, group: str, what: str, values: np.ndarray, *, of_map: bool = False) -> None:
     for limit in TAILS:
         number = np.count_nonzero(values > limit) if limit > 0 else np.count_nonzero(values < limit)
-        sheet.add_count(group, f"{what} {'above' if limit > 0 else 'below'} {limit:g} sigma", number)
+        sheet.add_count(group, f"{what} {'above' if limit > 0 else 'below'} {limit:g} sigma", number, of_map=of_map)
 
 
 def log_temporal_variance(residual: np.ndarray) -> np.ndarray:
-    """Log variance over time [plane, row, column] of a residual [plane, frame, row, column], in units of the rows'."""
+    """Log variance over time [plane, row, column] of a residual [plane, frame, row, column], relative to its row's."""
     return np.log(np.einsum("pfrc,pfrc->prc", residual, residual) / np.float32(residual.shape[1] - 1) + 1e-3)
 
 
 def variance_over_time(sheet: Sheet, x: Exposure, log_variance: np.ndarray) -> None:
-    """Quantiles of the pixels' variances, and whether pixels of large mean vary more (hot ones do)."""
+    """Quantiles of the pixels' variances, and whether pixels of large mean vary more (hot pixels do)."""
     n = log_variance[0].size
     flat = log_variance.reshape(len(log_variance), n)
     level = np.log(np.exp(flat).mean(1))
@@ -162,7 +162,7 @@ def variance_over_time(sheet: Sheet, x: Exposure, log_variance: np.ndarray) -> N
 
 
 def frames_over_time(sheet: Sheet, x: Exposure) -> None:
-    """Means and noise of whole frames: flicker, drift, jitter. Means are in units of what independent pixels give."""
+    """Means and noise of whole frames: flicker, drift, jitter. The unit of means is their error from pixel noise."""
     planes, frames, rows, columns = x.shape
     if frames == 1:
         return
@@ -195,7 +195,7 @@ def frames_over_time(sheet: Sheet, x: Exposure) -> None:
 def blocks(sheet: Sheet, x: Exposure) -> None:
     """Coarse shape of the static map and of the noise: slow cosines and an 8 x 8 grid of blocks.
 
-    All is in units of what independent pixels give; a map is common to the colours where planes are summed.
+    The unit is what independent pixels give. Planes are summed where a map is common to the colours.
     """
     planes, frames, rows, columns = x.shape
     noise = np.abs(x.bounded).mean(1)
@@ -220,7 +220,7 @@ def blocks(sheet: Sheet, x: Exposure) -> None:
 
 
 def _shape_of_map(sheet: Sheet, name: str, values: np.ndarray) -> None:
-    """Mixed slow cosines and blocks of a map [plane, row, column], about white with variance 1."""
+    """Mixed slow cosines and blocks of a map [plane, row, column] that is about white with variance 1."""
     planes, rows, columns = values.shape
     common = values.sum(0) / np.float32(np.sqrt(planes))
     mixed = cosines(rows) @ common @ cosines(columns).T
@@ -231,7 +231,7 @@ def _shape_of_map(sheet: Sheet, name: str, values: np.ndarray) -> None:
 
 
 def _grid(x: np.ndarray) -> np.ndarray:
-    """Sums over an 8 x 8 grid of blocks of x [..., row, column], in units of the root of their pixels."""
+    """Sums over an 8 x 8 grid of blocks of x [..., row, column], divided by the root of their number of pixels."""
     rows, columns = x.shape[-2] // GRID, x.shape[-1] // GRID
     x = x[..., : rows * GRID, : columns * GRID]
     over_columns = x.reshape(*x.shape[:-1], GRID, columns).sum(-1)

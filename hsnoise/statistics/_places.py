@@ -1,16 +1,16 @@
-"""Where in the frame static patterns lie, and on which side of the mean: most statistics have no sign."""
+"""Place and sign of static patterns in the frame; most other statistics have no sign."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from hsnoise._core.types import cfa_tile
+from hsnoise.effects import Places
 from hsnoise.frames.stack import FrameStack
 
-LENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)  # of the decay of a black level, in widths or heights of the frame
+LENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)  # decay lengths of a black level, in widths or heights of the frame
 SCALES, ASPECTS = (0.1, 0.2, 0.4), (0.7, 1.0, 1.5)  # of a glow
 ENDS = (0.0, 0.5, 1.0)
 SPOTS = [(row, column) for row in ENDS for column in ENDS if (row, column) != (0.5, 0.5)]
@@ -18,21 +18,8 @@ BLOCKS = 16  # of a map, in each direction
 FEWEST_FRAMES = 2
 
 
-@dataclass(frozen=True)
-class Places:
-    """What comes closest to the dark frames, whether or not there is any of it.
-
-    shading: axis, start, above and length of a `BlackShading`. glow: row and column of an `AmplifierGlow`.
-    second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1.
-    """
-
-    shading: tuple[str, str, bool, float]
-    glow: tuple[float, float]
-    second_chain: int
-
-
 def places(stack: FrameStack) -> Places:
-    """Where patterns lie in the dark frames of a stack."""
+    """The places of patterns in the dark frames of a stack."""
     step, width = len(cfa_tile(stack.cfa)), 1 if stack.cfa == "mono" else 2
     lines: dict[str, list[np.ndarray]] = {"row": [], "column": []}
     contrast, maps = 0.0, []
@@ -54,13 +41,13 @@ def places(stack: FrameStack) -> Places:
 
 
 def _colours_together(line: np.ndarray, step: int) -> np.ndarray:
-    """Means of a profile over the lines of a cell of colours, less their mean."""
+    """Means of a profile over each `step` rows (columns) of a Bayer cell, minus their overall mean."""
     line = line[: len(line) // step * step].reshape(-1, step).mean(1)
     return line - line.mean()
 
 
 def _shading(profiles: dict[str, np.ndarray]) -> tuple[str, str, bool, float]:
-    """From profiles [frame, line] by axis: the axis is the one that bends most for its scatter over frames."""
+    """Shading from profiles [frame, n] by axis; it lies along the axis that bends most for its scatter over frames."""
     found = []
     for axis, lines in profiles.items():
         sides = product(("first", "last"), LENGTHS)
@@ -74,7 +61,7 @@ def _shading(profiles: dict[str, np.ndarray]) -> tuple[str, str, bool, float]:
 
 
 def _decay(n: int, start: str, length: float) -> np.ndarray:
-    """exp(-distance / length) of n lines, of mean 0 and unit norm."""
+    """exp(-distance / length) over n rows (columns), of mean 0 and unit norm."""
     shape = np.exp(-np.linspace(0, 1, n) / length)
     shape = shape - shape.mean()
     shape = shape / np.sqrt((shape**2).sum())
@@ -82,7 +69,7 @@ def _decay(n: int, start: str, length: float) -> np.ndarray:
 
 
 def _glow(brightness: np.ndarray) -> tuple[float, float]:
-    """The spot from which a map [row, column] fades, of the corners and the middles of the edges."""
+    """The corner or middle of an edge from which a map [row, column] fades."""
     rows, columns = brightness.shape
     tall, wide = max(rows // BLOCKS // 2 * 2, 2), max(columns // BLOCKS // 2 * 2, 2)
     cut = brightness[: rows // tall * tall, : columns // wide * wide]

@@ -1,4 +1,4 @@
-"""What one exposure gives, and how the exposures of one half are averaged."""
+"""The statistics of one exposure, and their averages over exposures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 ABS_VARIANCE = 1 - 2 / np.pi  # of |x| of a standard normal x
-TINY_DN2 = 1e-4  # far below the variance of rounding: keeps logarithms of empty variances finite
+TINY_DN2 = 1e-4  # far below the variance of rounding; keeps the logarithm of a zero variance finite
 LARGEST_CORRELATION = 0.9999
 
 
@@ -19,7 +19,7 @@ def log_ratio(above: np.ndarray, below: np.ndarray | float) -> np.ndarray:
 
 
 def fisher(correlation: np.ndarray) -> np.ndarray:
-    """artanh of correlations: standard error 1/sqrt(n) whatever their size."""
+    """artanh of correlations: its standard error is 1/sqrt(n) for any correlation."""
     return np.arctanh(np.clip(correlation, -LARGEST_CORRELATION, LARGEST_CORRELATION))
 
 
@@ -32,11 +32,15 @@ def correlation(a: np.ndarray, b: np.ndarray, axes: tuple[int, ...]) -> np.ndarr
 
 @dataclass(frozen=True)
 class Entry:
-    """A statistic of one exposure: a value with its standard error, or a number of rare pixels."""
+    """A statistic of one exposure: a value with its standard error, or a number of rare pixels.
+
+    of_map: whether it describes the static map itself, which in flats shows the shape of the light.
+    """
 
     value: float
     error: float
     is_count: bool = False
+    of_map: bool = False
 
 
 @dataclass
@@ -46,16 +50,16 @@ class Sheet:
     letters: tuple[str, ...]
     entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
 
-    def add(self, group: str, what: str, values: np.ndarray | float, error: float) -> None:
-        """The mean of `values` over whatever axes they have; `error` is that of the mean."""
+    def add(self, group: str, what: str, values: np.ndarray | float, error: float, *, of_map: bool = False) -> None:
+        """The mean of `values` over all axes; `error` is the standard error of that mean."""
         values = np.asarray(values, np.float64)
-        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error))
+        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error), of_map=of_map)
 
-    def add_count(self, group: str, what: str, number: float) -> None:
-        self.entries[group, what] = Entry(float(number), 0.5, is_count=True)
+    def add_count(self, group: str, what: str, number: float, *, of_map: bool = False) -> None:
+        self.entries[group, what] = Entry(float(number), 0.5, is_count=True, of_map=of_map)
 
     def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
-        """One statistic a colour from values [plane]; `error` is that of one plane."""
+        """One statistic per colour from values [plane]; `error` is that of one plane."""
         for colour in dict.fromkeys(self.letters):
             of = [i for i, letter in enumerate(self.letters) if letter == colour]
             name = what if colour == "mono" else f"{what}, {colour}"
@@ -65,7 +69,7 @@ class Sheet:
 def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
     """The statistics of the exposures of one half: means, and square roots of summed numbers.
 
-    An exposure of few frames has fewer statistics than others: the mean is over those that have one.
+    Exposures with few frames lack some statistics: each mean is over the exposures that have it.
     """
     keys = dict.fromkeys(key for sheet in sheets for key in sheet.entries)
     out = {}
@@ -73,8 +77,8 @@ def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
         found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
         total = sum(entry.value for entry in found)
         if found[0].is_count:
-            entry = Entry(math.sqrt(total), 0.5)
+            value, error = math.sqrt(total), 0.5
         else:
-            entry = Entry(total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found))
-        out[group, f"{what}, {half}"] = entry
+            value, error = total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found)
+        out[group, f"{what}, {half}"] = Entry(value, error, of_map=found[0].of_map)
     return out

@@ -1,4 +1,4 @@
-"""What persists from one exposure to the next: static maps, profiles and variances of the same pixels, compared."""
+"""What persists between exposures: static maps, profiles and variances of the same pixels are compared."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts are imported when they are used
+import scipy  # its submodules are imported on first use
 
 from hsnoise.statistics._anova import BOUND, Exposure
 from hsnoise.statistics._pixels import log_temporal_variance
@@ -14,7 +14,7 @@ from hsnoise.statistics._sheet import Entry, fisher, log_ratio
 
 OUTLIER = 4.0
 OUTLIERS = (1, 2, 3, 5)
-MOST_VARIANCE = 50.0  # of a pixel, in units of its row's: one hit must not stand for all pixels
+MOST_VARIANCE = 50.0  # of a pixel, in units of its row's: one hit must not dominate all pixels
 MOST_MAP_SIDE = 512
 VARIANCE_FRAMES = 3
 
@@ -23,8 +23,8 @@ VARIANCE_FRAMES = 3
 class View:
     """The static part of one exposure, or of its even or odd frames.
 
-    half: 0 low, 1 high (even, odd). pixel [plane, row, column] in units of its robust spread; row [plane, row] and
-    column [plane, column], DN; log_variance [plane, row, column] over time, None with too few frames.
+    half: 0 short, 1 long (or even, odd). pixel [plane, row, column] in units of its robust spread; row [plane, row] and
+    column [plane, column], DN; log_variance [plane, row, column] over time, None if frames are too few.
     """
 
     half: int
@@ -39,7 +39,7 @@ def view_of(x: Exposure, half: int, log_variance: np.ndarray | None) -> View:
 
 
 def even_and_odd(x: Exposure) -> Iterator[View]:
-    """Views of the even and of the odd frames of one exposure, for captures that have no other."""
+    """Views of the even and the odd frames of one exposure, for captures with only one."""
     for parity in (0, 1):
         some = x.residual[:, parity::2]
         mean = (some * x.scale[:, parity::2, :, None]).mean(1)
@@ -98,12 +98,12 @@ def map_peak(views: list[View]) -> float:
 
 
 def outliers_of(x: Exposure) -> np.ndarray:
-    """Number of frames [plane, row, column] in which a pixel lies far from its mean."""
+    """Number of frames [plane, row, column] in which each pixel lies far from its mean."""
     return (np.abs(x.bounded) > OUTLIER).sum(1, dtype=np.uint16)
 
 
 def outlier_counts(outliers: np.ndarray) -> dict[tuple[str, str], Entry]:
-    """Square root of the number of pixels with so many outliers: hits come alone, jumping pixels repeat."""
+    """Square roots of the numbers of pixels by their number of outliers: hits come alone, jumping pixels repeat."""
     out = {}
     for number in OUTLIERS:
         exact = number < 3

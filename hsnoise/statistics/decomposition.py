@@ -4,8 +4,8 @@ Counts of one colour plane are a sum of independent random effects,
 
     y[f, r, c] = mean + F[f] + R[r] + C[c] + RF[f, r] + CF[f, c] + P[r, c] + e[f, r, c],
 
-whose variances follow without bias from the mean squares of an analysis of variance: each mean square expects the
-variance of its own effect and, divided by how many pixels were averaged, those of the finer ones, which are taken off.
+whose variances follow without bias from the mean squares of an analysis of variance. The expectation of a mean square
+is the variance of its own effect plus those of the finer effects divided by the pixels averaged, which are subtracted.
 
 Reference: D'Agostino and Webb, "Three-dimensional analysis framework and measurement methodology for imaging system
 noise", SPIE 1488, 1991; expected mean squares: Searle, Casella, McCulloch, *Variance Components*, 1992.
@@ -20,14 +20,14 @@ import numpy as np
 
 COMPONENTS = ("frame", "row", "column", "row_x_frame", "column_x_frame", "pixel", "temporal")
 STATIC = ("row", "column", "pixel")
-BLOCK_ROWS = 256  # rows that are float64 at a time
+BLOCK_ROWS = 256  # rows converted to float64 at a time
 
 
 @dataclass(frozen=True)
 class Component:
-    """Variance of one component and its standard error, DN^2 (NaN: these frames do not tell), and its share.
+    """Variance of one component and its standard error, DN^2 (NaN: not determined by these frames), and its share.
 
-    chance_dn2: standard deviation of the estimate where there is no such component.
+    chance_dn2: standard deviation of the estimate if the component is absent.
     """
 
     variance_dn2: float
@@ -47,9 +47,9 @@ def mean_of(parts: Sequence[Component]) -> Component:
 
 
 class PlaneSums:
-    """Sums of one colour plane over its frames, from which the decomposition follows; frames are added one by one.
+    """Running sums of one colour plane, from which the decomposition follows; frames are added one by one.
 
-    Memory: one int32 a pixel, whatever the number of frames.
+    Memory: one int32 per pixel, for any number of frames.
     """
 
     def __init__(self, shape: tuple[int, int]):
@@ -90,7 +90,7 @@ class PlaneSums:
         return self.pixel.astype(np.float32) / np.float32(self.n_frames) + np.float32(self.reference)
 
     def components(self) -> dict[str, Component]:
-        """The variances of all components; standard errors are those of normal noise."""
+        """The variances of all components; standard errors assume normal noise."""
         n, (h, w) = self.n_frames, self.shape
         if n < 2 or min(h, w) < 2:
             return dict.fromkeys(COMPONENTS, Component(np.nan, np.nan))
@@ -98,7 +98,7 @@ class PlaneSums:
 
 
 def of_neighbouring_rows(row_mean_dn: np.ndarray) -> Component:
-    """What neighbouring rows share in a frame, of row means [frame, row]: a covariance, DN^2; 0 of white rows."""
+    """Covariance of neighbouring rows in a frame, DN^2, from row means [frame, row]; 0 for white rows."""
     n, h = row_mean_dn.shape
     if n < 2 or h < 3:
         return Component(np.nan, np.nan)
@@ -109,7 +109,7 @@ def of_neighbouring_rows(row_mean_dn: np.ndarray) -> Component:
 
 
 def _sums_of_squares(sums: PlaneSums) -> dict[str, float]:
-    """Sum of squares of each effect; they add up to that of all counts about their mean."""
+    """Sum of squares of each effect; together they are that of all counts about their mean."""
     n, (h, w) = sums.n_frames, sums.shape
     row_frame, column_frame = np.stack(sums.rows), np.stack(sums.columns)  # sums over columns; over rows
     whole = row_frame.sum()
@@ -141,7 +141,7 @@ def _from_mean_squares(squares: dict[str, float], n: int, h: int, w: int) -> dic
         "temporal": (n - 1) * (h - 1) * (w - 1),
     }
     mean = {name: squares[name] / dof[name] for name in COMPONENTS}
-    # Which mean squares, with which sign, leave an effect's own variance, and how many counts one of it spans.
+    # The signed mean squares that isolate an effect's variance, and the counts that one value of the effect spans.
     contrasts: dict[str, tuple[int, dict[str, int]]] = {
         "temporal": (1, {"temporal": 1}),
         "pixel": (n, {"pixel": 1, "temporal": -1}),
@@ -156,7 +156,7 @@ def _from_mean_squares(squares: dict[str, float], n: int, h: int, w: int) -> dic
         span, signs = contrasts[name]
         variance = sum(sign * mean[other] for other, sign in signs.items()) / span
         error = np.sqrt(sum(2 * mean[other] ** 2 / dof[other] for other in signs)) / span
-        without = mean[name] - span * variance  # what its mean square expects if there is none
+        without = mean[name] - span * variance  # expectation of its mean square if it is absent
         rest = sum(2 * mean[other] ** 2 / dof[other] for other in signs if other != name)
         chance = np.sqrt(2 * without**2 / dof[name] + rest) / span
         found[name] = Component(float(variance), float(error), chance_dn2=float(chance))

@@ -1,19 +1,19 @@
-"""Read noise below the width of a count: what rounding leaves of it, and what it is at most.
+"""Read noise below the width of a count: an estimate despite rounding, and an upper bound.
 
-A pixel at level mu with noise sigma < 0.5 DN mostly holds one count, or two if mu lies near the edge between them: its
-variance over time depends on where between two counts its level lies, and is not sigma^2 + 1/12. What is measured, the
-pooled histogram of counts and the mean variance over time, are averages over the levels of the pixels, whatever these
-are; sigma is possible if some distribution of levels has these averages.
+A pixel at level mu with noise sigma < 0.5 DN mostly holds one count, or two if mu lies near the edge between them. Its
+variance over time depends on where between two counts its level lies, and is not sigma^2 + 1/12. The measured pooled
+histogram and mean variance over time are averages over the unknown levels of the pixels; a sigma is possible if some
+distribution of levels has these averages.
 """
 
 from __future__ import annotations
 
 import numpy as np
-import scipy  # its parts are imported when they are used
+import scipy  # its submodules are imported on first use
 
 SIGMAS_DN = np.geomspace(0.02, 1.0, 120)
-STEPS_PER_DN = 50  # of the levels that are tried
-NEAR = 2e-3  # misfit of shares and variance that counts as none: noise is not quite normal
+STEPS_PER_DN = 50  # of the grid of levels
+NEAR = 2e-3  # tolerated misfit of shares and variance: noise is not quite normal
 MOST_COUNTS = 64
 MOST_PIXELS = 1_000_000
 
@@ -21,8 +21,8 @@ MOST_PIXELS = 1_000_000
 def narrow_read_noise(counts) -> tuple[float, float]:
     """Read noise of darks of one exposure and colour [frame, row, column], DN: an estimate, and an upper bound.
 
-    The estimate takes the levels of the pixels for normally distributed; it is NaN where that cannot be. The bound
-    takes them as they may be, and the noise of a pixel for normal. Both are infinite for noise wider than 1 DN.
+    The estimate assumes normally distributed levels; it is NaN where that is impossible. The bound allows any
+    distribution of levels but assumes that a pixel's noise is normal. Both are infinite for noise wider than 1 DN.
 
     Raises:
         ValueError: fewer than two frames.
@@ -32,7 +32,7 @@ def narrow_read_noise(counts) -> tuple[float, float]:
         raise ValueError(f"counts: expected two frames or more [frame, row, column], got an array of {counts.shape}")
     y = counts.reshape(len(counts), -1)
     y = y[:, :: max(y.shape[1] // MOST_PIXELS, 1)].astype(np.float64)
-    within = float(y.var(0, ddof=1).mean() - y.mean(1).var(ddof=1))  # an offset of the frame is no noise of pixels
+    within = float(y.var(0, ddof=1).mean() - y.mean(1).var(ddof=1))  # offsets of frames are not pixel noise
     lowest, highest = np.quantile(y, (1e-4, 1 - 1e-4))
     if within > 1 or highest - lowest > MOST_COUNTS:
         return np.inf, np.inf
@@ -55,7 +55,7 @@ def _moments(codes: np.ndarray, law: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _bound(codes: np.ndarray, share: np.ndarray, variance: float) -> float:
-    """The least sigma above all with which some levels have these shares of counts and this variance over time."""
+    """The smallest sigma above all that are possible with these shares of counts and this variance over time."""
     levels = np.linspace(codes[0], codes[-1], STEPS_PER_DN * (len(codes) - 1) + 1)
     possible = [i for i, s in enumerate(SIGMAS_DN[:-1]) if _misfit(codes, levels, s, share, variance) < NEAR]
     return float(SIGMAS_DN[max(possible) + 1]) if possible else np.inf

@@ -1,8 +1,8 @@
-"""About 300 statistics of dark frames, each variance-stabilised: where a capture and a model's draws are compared.
+"""About 300 variance-stabilised statistics of dark frames, by which a capture and a model's draws are compared.
 
-Marginal histograms do not tell row noise from white noise of the same variance; these statistics do. They are log
-ratios of variances, artanh of correlations and square roots of rare numbers, so that their spread hardly depends on
-the camera. What decides between effects is mostly correlation: between colours, frames, exposures, neighbours.
+Marginal histograms cannot separate row noise from white noise of the same variance; these statistics can. They are log
+ratios of variances, artanh of correlations and square roots of rare counts, so their spread hardly depends on the
+camera. Mostly correlations separate effects: between colours, frames, exposures, neighbours.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
 from hsnoise.statistics._anova import Exposure, Layout, check_size, layout_of, read_exposure
 from hsnoise.statistics._codes import code_step
-from hsnoise.statistics._places import Places, places
+from hsnoise.statistics._places import places
 from hsnoise.statistics._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["Places", "SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
+__all__ = ["SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Statistics of one capture. Names, groups and order depend on sizes, colours and numbers of frames only.
+    """Statistics of one capture. Names, groups and order depend only on sizes, colours and numbers of frames.
 
-    values [statistic]: finite. error [statistic]: rough standard error under independent pixels, a floor for the
-    spread over a model's draws. skipped: sentences on what was left out, and why.
+    values [statistic]: finite. error [statistic]: rough standard error for independent pixels, a floor for the
+    spread over a model's draws. skipped: sentences on what was left out and why.
     """
 
     names: tuple[str, ...]
@@ -43,29 +43,40 @@ WORDS = {
     " in band ": "bands: ranges of frequency over the rows or columns of a frame, from slow to fast",
     "row x frame": "row x frame, column x frame: means of rows or columns that are new in each frame",
     "static map": "static map: mean over the frames, what stays in place",
-    " / ": "a / b: logarithm of the ratio of their mean squares, 0 where independent noise of the pixels makes both",
-    "residual": "residual: a pixel of a frame less its row, its column and its mean over frames, in spreads of its row",
+    " / ": "a / b: logarithm of the ratio of their mean squares, 0 if independent pixel noise makes both",
+    "residual": "residual: a pixel of a frame minus its row, column and mean over frames, in spreads of its row",
     "correlation, same ": "correlation, same row (column): of two colours that share a row (column) of the sensor",
-    "coherence": "coherence: how much of a band of frequencies the colours have in common",
-    "strongest frequency": "strongest frequency: how much of the static rows (columns) is one sine",
-    "steps of ": "steps of n: how much the mean of n lines changes to the next n",
-    "parity": "parity: even against odd lines",
-    "kurtosis": "log kurtosis: weight of the tails, 0 for a normal law",
+    "coherence": "coherence: how much of a frequency band the colours have in common",
+    "strongest frequency": "strongest frequency: how much of the static rows (columns) is a single sine",
+    "steps of ": "steps of n: how much the mean changes from n rows (columns) to the next n",
+    "parity": "parity: even against odd rows (columns)",
+    "kurtosis": "log kurtosis: weight of the tails, 0 for a normal distribution",
     "energy of ": "energy of blocks: scatter of the means of blocks of pixels",
     "roughness": "roughness: how much a histogram jumps from code to code",
 }
 
-# What flats tell whatever the light: neither its level, its flicker nor its shape, to which dust belongs.
-SHAPE_OF_LIGHT = ("map, ", "pixels of the map", "log kurtosis of the map")
-FLAT_GROUPS = ("noise", "static pixels", "pixels over time", "spatial lags", "tails", "row x frame", "column x frame")
+# What flats tell whatever the light, and what it is called there: neither the light's level, its flicker nor its shape,
+# to which dust belongs.
+OF_FLATS = {
+    group: f"flats, {group}"
+    for group in (
+        "noise",
+        "static pixels",
+        "pixels over time",
+        "spatial lags",
+        "tails",
+        "row x frame",
+        "column x frame",
+    )
+}
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # `_ordered` replaces non-finite values by 0
 def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
-    """The statistics of the exposures of a stack, darks and flats apart.
+    """The statistics of the exposures of a stack, darks and flats separately.
 
-    Exposures are averaged over the shorter half and the longer half of the exposure times. A single exposure gives
-    averages over all its frames; what persists is then compared between its even and odd frames.
+    They are averaged over the shorter and the longer half of the exposure times. A single exposure is averaged over all
+    its frames; persistence is then judged from its even and odd frames.
 
     Args:
         stack: the capture.
@@ -79,9 +90,9 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     if "flat" in stack.kind:
         lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
         entries |= {
-            (f"flats, {group}", what): e
-            for (group, what), e in lit.items()
-            if group in FLAT_GROUPS and not what.startswith(SHAPE_OF_LIGHT)
+            (OF_FLATS[group], what): entry
+            for (group, what), entry in lit.items()
+            if group in OF_FLATS and not entry.of_map
         }
     return _ordered(entries, layout)
 
@@ -114,7 +125,7 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
 
 @dataclass
 class _Capture:
-    """What is kept of the exposures read so far; never their frames."""
+    """The statistics of the exposures read so far, without their frames."""
 
     sheets: list[Sheet]
     spectra: list[dict[str, np.ndarray]]
@@ -150,7 +161,7 @@ class _Capture:
 
 
 def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, str], Entry]:
-    """Highest lines of the periodograms averaged over exposures."""
+    """Highest peaks of the periodograms, averaged over exposures."""
     out = {}
     for group, mean in _averages(spectra).items():
         where = "row spectrum" if group == "row x frame" else group
@@ -159,28 +170,28 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
 
 
 def _shares(profiles: list[dict[str, np.ndarray]]) -> dict[tuple[str, str], Entry]:
-    """How much one frequency has of the static rows and columns, averaged over exposures."""
+    """The strongest frequency's share of static rows and columns, averaged over exposures."""
     shares = {group: _lines.strongest_share(mean) for group, mean in _averages(profiles).items()}
     return {(group, "strongest frequency"): Entry(share, 0.15) for group, share in shares.items()}
 
 
 def _averages(exposures: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Mean by group, over the exposures that have it: those of one frame have nothing static."""
+    """Mean by group over the exposures that have it: single frames have no static part."""
     groups = dict.fromkeys(group for of in exposures for group in of)
     return {group: np.mean([of[group] for of in exposures if group in of], 0) for group in groups}
 
 
 def explained(names: Iterable[str]) -> tuple[str, ...]:
-    """Sentences on the words in names of statistics that are not plain."""
+    """Sentences that explain the technical words in names of statistics."""
     text = "; ".join(names)
     return tuple(sentence for word, sentence in WORDS.items() if word in text)
 
 
 def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: np.ndarray) -> tuple[str, float]:
-    """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each.
+    """The strongest spectral line that is new in each dark frame: "row" or "column", and its frequency in cycles each.
 
-    Strong is what exceeds the spectra of a model's `draws`: rows of a Bayer pattern with 1/f gains have a peak at
-    half a cycle, as colours take turns.
+    Strength is relative to the spectra of a model's `draws`: rows of a Bayer pattern with 1/f gains have a peak at
+    half a cycle, because colours alternate.
     """
     layout = layout_of(stack)
     used = {"row": layout.rows, "column": layout.columns}
@@ -202,7 +213,7 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
 
 
 def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -> dict[tuple[str, str], Entry]:
-    """How far mean and variance of the middle exposure lie off the line through the first and the last."""
+    """Distance of the middle exposure's mean and variance from the straight line through the first and the last."""
     if len(exposures) < 3:
         return {}
     middle = len(exposures) // 2
@@ -221,7 +232,7 @@ def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -
 
 
 def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure:
-    """All statistics, group by group; what is not finite has no meaning and is 0 in captures and draws alike."""
+    """All statistics, group by group; non-finite values carry no information and become 0 in captures and draws."""
     keys = sorted(entries, key=lambda key: key[0])
     return Structure(
         names=tuple(f"{group}: {what}" for group, what in keys),
@@ -233,17 +244,19 @@ def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure
 
 
 def _too_few(layout: Layout) -> tuple[str, ...]:
-    """Sentences on the statistics that the numbers of frames and exposures do not allow."""
+    """Sentences on statistics that need more frames or exposures."""
     frames, n = max(layout.frames), len(layout.frames)
     out = []
     if frames < 2:
-        out.append("A single frame does not tell static patterns from noise: what needs two frames is left out.")
+        out.append("A single frame cannot separate static patterns from noise: statistics of two frames are left out.")
     elif frames < _views.VARIANCE_FRAMES:
-        out.append("Two frames do not give a variance over time for each pixel: what needs three frames is left out.")
+        out.append("Two frames give no variance over time for each pixel: statistics of three frames are left out.")
     if 2 <= frames < 4:
-        out.append("Flicker and drift are told apart from four frames on: their statistics are left out.")
+        out.append("Separating flicker from drift takes four frames: their statistics are left out.")
     if n == 1 and frames // 2 < _views.VARIANCE_FRAMES:
-        out.append("Whether noisy pixels stay noisy needs two exposures or six frames: it is left out.")
+        out.append("Testing whether noisy pixels stay noisy takes two exposures or six frames: this is left out.")
     if n < 3:
-        out.append("Whether mean and variance grow in proportion to exposure needs three exposures: it is left out.")
+        out.append(
+            "Testing whether mean and variance are proportional to exposure takes three exposures: this is left out."
+        )
     return tuple(out)

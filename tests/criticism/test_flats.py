@@ -5,13 +5,14 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from hsnoise.criticism.reference import measure
 
 import hsnoise
 from hsnoise import effects as fx
 from hsnoise.criticism.candidates import built_in
-from hsnoise.criticism.reference import measure
 from hsnoise.frames.stack import FrameStack
-from hsnoise.simulation.draws import draw_capture, light_of, part_of
+from hsnoise.simulation.draws import draw_capture, light_of
+from hsnoise.simulation.portion import Portion
 
 CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
 SHAPE, FRAMES = (64, 96), 8
@@ -42,7 +43,7 @@ def capture(model, seed=0):
 
 @pytest.fixture(scope="module")
 def plain():
-    return part_of(capture(CAMERA))
+    return Portion.of(capture(CAMERA)).frames
 
 
 def test_light_is_that_of_the_flats(plain):

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import hsnoise
+from hsnoise._core.events import Event
 from hsnoise.criticism.improve import _stage, _Work
+from hsnoise.criticism.outcomes import Ended, Ending
 from hsnoise.criticism.story import Step
 
 improve = importlib.import_module("hsnoise.criticism.improve")
@@ -59,25 +61,26 @@ def test_the_time_ends_a_fit_at_the_next_draw(clock, stack, monkeypatch):
     def first_that_holds(self, nearest, steps):
         tried.append(nearest)
         clock.s += 121
-        self.counter("Step 1: adding row_noise", 40)()
+        self.counter(Event("Step 1: adding row_noise"), 40)()
 
-    nearest = (SimpleNamespace(name="row_noise", score=99.0),)
-    monkeypatch.setattr(improve, "diagnose", lambda *_, **__: "found")
+    nearest, found = (SimpleNamespace(name="row_noise", score=99.0),), SimpleNamespace(headline="", advice="")
+    monkeypatch.setattr(improve, "diagnose", lambda *_, **__: found)
     monkeypatch.setattr(improve, "_nearest", lambda found: nearest)
     monkeypatch.setattr(_Work, "first_that_holds", first_that_holds)
     story = hsnoise.improve(stack, max_minutes=2)
     assert tried == [nearest] and story.errors == (26.34,)
-    assert story.steps[0].diagnosis == "found" and story.ended.startswith("It stopped after 2 minutes")
+    assert story.steps[0].diagnosis is found and story.ending == Ending(Ended.MINUTES, 2)
 
 
 def test_without_a_limit_nothing_is_ended(clock, stack, monkeypatch):
     def diagnose(*_, progress, **__):
         clock.s += 1e9
         progress()
-        return SimpleNamespace(verdict="nothing missing", best=None)
+        return SimpleNamespace(verdict="nothing missing", best=None, headline="", advice="")
 
     monkeypatch.setattr(improve, "diagnose", diagnose)
-    assert "No effect stands out" in hsnoise.improve(stack).ended
+    story = hsnoise.improve(stack)
+    assert story.ending.why == Ended.WEAK_LEFT and "No effect stands out" in story.ended
 
 
 @pytest.mark.parametrize("minutes", [0, -1, float("nan")])
@@ -87,6 +90,6 @@ def test_a_limit_that_is_none_is_refused(minutes, stack):
 
 
 def test_a_stage_tells_its_step_and_the_error_until_now():
-    assert _stage("comparing", []) == "Step 0: comparing"
-    assert _stage("looking", [step(26.34)]) == "Step 1: looking; error 26.3"
-    assert _stage("looking", [step(26.34), step(9.0), step(1.59)]) == "Step 3: looking; error 26.3 -> 1.59"
+    assert str(_stage("comparing", [])) == "Step 0: comparing"
+    assert str(_stage("looking", [step(26.34)])) == "Step 1: looking; error 26.3"
+    assert str(_stage("looking", [step(26.34), step(9.0), step(1.59)])) == "Step 3: looking; error 26.3 -> 1.59"

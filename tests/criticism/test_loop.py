@@ -11,17 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hsnoise.criticism.gaussian import Gaussian, shrunk
 
 import hsnoise
 from hsnoise import effects as fx
 from hsnoise.cli.demo import simulated
 from hsnoise.criticism import candidates as library
+from hsnoise.criticism import sentences
 from hsnoise.criticism.compare import Comparison, nearer
-from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.held_out import split_frames
-from hsnoise.criticism.improve import _is_there, _is_too_little, _left_out, _why_worse, _Work
-from hsnoise.criticism.story import Step, together
-from hsnoise.simulation.draws import darks_of, draw_capture
+from hsnoise.criticism.improve import _ending, _is_there, _is_too_little, _why_worse, _Work
+from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused
+from hsnoise.criticism.story import Step, Story, together
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
@@ -192,15 +195,15 @@ def test_a_large_capture_keeps_its_place_on_the_sensor():
     comparison = hsnoise.compare(truth, stack, draws=8)
     assert comparison.error < 3
     assert any("columns" in sentence for sentence in comparison.skipped)
-    assert darks_of(darks_of(stack)).window == darks_of(stack).window
+    assert Portion.of(darks_of(stack)).darks.frames.window == Portion.of(stack).darks.frames.window
 
 
 def test_a_capture_of_one_exposure_is_offered_no_clamp():
-    darks = darks_of(empty_stack(exposure_s=(0.1,)))
-    assert "black_clamp" not in library.built_in(
-        hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0), darks
-    )
-    assert "black_clamp" in library.built_in(MODEL.with_value("dark_current", "rate", 500.0), darks_of(empty_stack()))
+    darks = Portion.of(empty_stack(exposure_s=(0.1,))).darks.frames
+    dim = hsnoise.cameras.canon_5d3().with_value("dark_current", "rate", 50.0)
+    assert "black_clamp" not in library.built_in(library.facts_of(dim, darks))
+    bright = MODEL.with_value("dark_current", "rate", 500.0)
+    assert "black_clamp" in library.built_in(library.facts_of(bright, Portion.of(empty_stack()).darks.frames))
 
 
 @pytest.mark.slow
@@ -221,7 +224,7 @@ def test_improve_decides_the_side_of_the_gain_by_refits(tmp_path):
     stack, told = simulated(tmp_path)[0], []
     steps = [Step(hsnoise.fit(stack), SimpleNamespace(error=9.0), None, None, float("nan"), ())]
     wrong = SimpleNamespace(name="row_noise", effect=fx.RowNoise(1.4, after_gain=True))
-    step = _Work(stack, None, 0, told.append).with_one_more(steps, wrong)
+    step = _Work(stack, None, 0, lambda event: told.append(str(event))).with_one_more(steps, wrong)
     assert step.fit.params["row_noise"].after_gain is False and step.comparison.error < 2
     assert any("adding row_noise" in sentence for sentence in told)
     assert any("other side of the gain" in sentence and sentence[-1].isdigit() for sentence in told)
@@ -251,7 +254,7 @@ def test_shrunk_law_is_that_of_its_draws():
 
 def test_large_captures_are_cut_but_keep_their_rows():
     big = empty_stack(frames=3, shape=(1200, 1600), exposure_s=(0.1,))
-    cut = darks_of(big)
+    cut = Portion.of(big).darks.frames
     assert cut.shape[0] == 1200 and cut.shape[1] < 1600 and cut.shape[1] % 2 == 0
 
 
@@ -299,7 +302,8 @@ def test_an_addition_is_judged_by_all_groups(groups, held_out, converged, worse)
         comparison = SimpleNamespace(error=max(groups.values()) / 2, groups=groups)
         return Step(SimpleNamespace(params=MODEL, converged=converged), comparison, None, None, held_out, ())
 
-    said = _why_worse(step(groups, held_out, converged), step({"frames": 35.0, "columns": 20.0}, 0.0))
+    found = _why_worse(step(groups, held_out, converged), step({"frames": 35.0, "columns": 20.0}, 0.0))
+    said = "" if found is None else sentences.refusal(found)
     assert said.startswith(worse) and bool(said) is bool(worse)
 
 
@@ -309,7 +313,7 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     candidates, told = [SimpleNamespace(name=name, effect=effect) for name, effect in effects.items()], []
     step, tried = Step(SimpleNamespace(doubts=("of the fit before",)), None, None, "column_noise", 0.0, ()), []
     checked = replace(step, fit=SimpleNamespace(doubts=()))
-    why = {"frame_offset": "changed nothing by itself", "column_noise": ""}
+    why = {"frame_offset": Refusal(Refused.NO_CHANGE), "column_noise": None}
 
     def with_one_more(self, steps, candidate):
         tried.append(candidate.name)
@@ -318,8 +322,8 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     monkeypatch.setattr(_Work, "with_one_more", with_one_more)
     monkeypatch.setattr(_Work, "refusal", lambda self, effect, step, before: why[effect.name])
     monkeypatch.setattr(importlib.import_module("hsnoise.criticism.improve"), "rechecked", lambda *of: checked.fit)
-    work, steps = _Work(None, None, 0, told.append), [SimpleNamespace()]
-    reasons = {"row_noise": "could not be fitted", "frame_offset": "changed nothing by itself"}
+    work, steps = _Work(None, None, 0, lambda event: told.append(str(event))), [SimpleNamespace()]
+    reasons = {"row_noise": Refusal(Refused.NOT_FITTED), "frame_offset": Refusal(Refused.NO_CHANGE)}
     assert work.first_that_holds(candidates, steps) == (checked, reasons)
     assert tried == ["row_noise", "frame_offset", "column_noise"]
     assert told == ["row_noise is left out, could not be fitted", "frame_offset is left out, changed nothing by itself"]
@@ -327,12 +331,50 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
 
 
 def test_what_was_tried_in_vain_is_told_with_the_reason():
-    refused = {"row_noise": "came out compatible with zero", "hot_pixels": "could not be fitted"}
-    found = SimpleNamespace(verdict="unexplained", names=(), advice="")
-    said = _left_out(refused, found, SimpleNamespace(error=7.0))
-    assert "left out: row_noise came out compatible with zero; hot_pixels could not be fitted." in said
-    assert "no effect of the library explains (error 7.00)" in said
-    assert "error is 1.20, as chance gives" in _left_out(refused, found, SimpleNamespace(error=1.2))
+    refused = {"row_noise": Refusal(Refused.ZERO), "hot_pixels": Refusal(Refused.NOT_FITTED)}
+    found = SimpleNamespace(verdict="unexplained", names=(), headline="unexplained", advice="look at the tails")
+
+    def ended(error):
+        comparison = SimpleNamespace(error=error)
+        return Story((Step(None, comparison, found, None, 0.0, ()),), _ending(found, comparison, refused))
+
+    far, near = ended(7.0), ended(1.2)
+    assert far.ending.why == Ended.UNEXPLAINED and near.ending.why == Ended.AS_CHANCE
+    assert "left out: row_noise came out compatible with zero; hot_pixels could not be fitted." in far.ended
+    assert "no effect of the library explains (error 7.00): look at the tails. What was tried" in far.ended
+    assert "error is 1.20, as chance gives. What was tried" in near.ended
+
+
+@pytest.mark.parametrize(
+    ("ending", "short", "whole"),
+    [
+        (Ending(Ended.FINISHED), "Nothing significant is left", "Nothing significant is left (error 1.20)."),
+        (
+            Ending(Ended.FINISHED, following=("row_noise", 9.4)),
+            "Nothing significant is left",
+            "Nothing significant is left (error 1.20): row_noise would be next, by 9 nats, as chance gives among so"
+            " many.",
+        ),
+        (
+            Ending(Ended.NOT_HELD),
+            "Still missing: a or b, but no refit with it held",
+            "Still missing: a or b, but no refit with it held (error 1.20).",
+        ),
+        (
+            Ending(Ended.STEPS, 1),
+            "It stopped after 1 addition; something may be left",
+            "It stopped after 1 addition; something may be left.",
+        ),
+        (
+            Ending(Ended.UNFINISHED),
+            "Not finished",
+            "Not finished: whether something is missing was being looked for.",
+        ),
+    ],
+)
+def test_how_a_story_ended_is_told_in_short_and_whole(ending, short, whole):
+    assert sentences.ended_in_short(ending, "missing: a or b") == short
+    assert sentences.ended(ending, 1.2, "missing: a or b", "") == whole
 
 
 @pytest.mark.parametrize(
@@ -346,7 +388,7 @@ def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_ou
     if flats:  # between the darks
         counts, kinds = [counts[0], lit, counts[1]], ["dark", "flat", "dark"]
     stack = hsnoise.FrameStack(counts, np.arange(len(counts)), kind=kinds, shutter="global")
-    kept, unseen = split_frames(darks_of(stack), stack)
+    kept, unseen = split_frames(Portion.of(stack).darks.frames, stack)
     numbers = (fitted[0], 3, fitted[1]) if flats else fitted
     assert kept.n_frames == numbers and kept.kind == stack.kind
     assert (unseen is None) if held_out is None else (unseen.n_frames == held_out)

@@ -124,6 +124,6 @@ def test_candidate_that_is_no_effect(candidate):
 
 def test_candidate_that_does_nothing(monkeypatch):
     module = importlib.import_module("hsnoise.criticism.diagnose")  # the package has the function of that name
-    monkeypatch.setattr(module, "built_in", lambda model, darks: {})
+    monkeypatch.setattr(module, "built_in", lambda facts: {})
     with pytest.raises(ValueError, match="my_effect changed no count of 12 captures"):
         hsnoise.diagnose(CAMERA, COUNTS, candidates=[Mine(lambda signal: signal)], draws=16, **CAPTURE)

@@ -139,7 +139,8 @@ def test_no_effect_imports_another():
     for path in FOLDER.glob("[a-z]*.py"):
         imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
         own = {node.module for node in imports if node.module.startswith("hsnoise")}
-        assert own <= {"hsnoise._core.types", "hsnoise._core.coloured", "hsnoise.effects._base"}, path
+        base = {f"hsnoise.effects.{name}" for name in ("_base", "_facts", "_parameters")}
+        assert own <= {"hsnoise._core.types", "hsnoise._core.coloured", *base}, path
 
 
 @each_effect

@@ -103,7 +103,7 @@ def test_exposure_by_the_folder(tmp_path):
             tifffile.imwrite(tmp_path / f"darks_{seconds}s" / f"{i}.tif", frame, photometric="minisblack")
     stack = load(tmp_path)
     assert groups(stack) == [("dark", 1, 2), ("dark", 30, 2)]
-    assert "4 frames: exposure by the names of files and folders (1, 30 s)" in stack.assumed
+    assert "4 frames: exposure taken from the names of files and folders (1, 30 s)" in stack.assumed
 
 
 def test_what_does_not_belong_is_set_aside_and_named(night):
@@ -158,7 +158,7 @@ def test_an_open_shutter_makes_a_flat(tmp_path):
 def test_sizes_of_which_neither_is_the_most(tmp_path):
     write_some(tmp_path / "a", EXPTIME=1.0)
     write_some(tmp_path / "b", EXPTIME=2.0, shape=(12, 20))
-    with pytest.raises(ValueError, match="of either there are as many; all frames must have one size"):
+    with pytest.raises(ValueError, match="there are equally many of both; all frames must have one size"):
         load(tmp_path)
     write_some(tmp_path / "flats", level=FLAT_DN, EXPTIME=1.0)
     stack = load(tmp_path)  # darks of the size of the flats

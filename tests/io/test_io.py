@@ -151,7 +151,7 @@ def test_fits_bayer_order(tmp_path):
     assert load(path).cfa == "GRBG"
     path.unlink()
     write_fits(path, dark_counts(2, 8, 10), EXPTIME=2, BAYERPAT="RGGB", ROWORDER="BOTTOM-UP")
-    with pytest.raises(ValueError, match="a.fits: a colour mosaic, but its Bayer order is not certain; give cfa="):
+    with pytest.raises(ValueError, match="a.fits: a colour mosaic of unknown Bayer order; give cfa="):
         load(path)
     assert load(path, cfa="GBRG").cfa == "GBRG"
 
@@ -195,7 +195,7 @@ def test_tiff_of_a_colour_mosaic(tmp_path, codes, given, cfa):
         tifffile.imwrite(tmp_path / f"{i}.tif", frame, photometric=32803, extratags=tags, metadata=None)
     assert load(tmp_path, exposure_s=1, cfa=given).cfa == cfa
     if given is not None:
-        with pytest.raises(ValueError, match="0.tif: a colour mosaic, but its Bayer order is not certain"):
+        with pytest.raises(ValueError, match="0.tif: a colour mosaic of unknown Bayer order"):
             load(tmp_path, exposure_s=1)
 
 

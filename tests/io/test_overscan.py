@@ -33,13 +33,13 @@ def sensor(tmp_path):
 def test_overscan_is_named_by_default(sensor):
     stack = load(sensor)
     assert stack.shape == (40, 100) and stack.overscan_dn is None
-    assert stack.assumed == ("The last 12 columns look like overscan: overscan='auto' takes them off",)
+    assert stack.assumed == ("The last 12 columns look like overscan: overscan='auto' removes them",)
 
 
 @pytest.mark.parametrize("overscan", ["auto", (None, (88, 100)), ((0, 40), (88, 100))])
 def test_overscan_taken_off(sensor, overscan):
     stack = load(sensor, overscan=overscan)
-    assert stack.shape == (40, 88) and stack.assumed == ("The last 12 columns were taken off as overscan",)
+    assert stack.shape == (40, 88) and stack.assumed == ("The last 12 columns were removed as overscan",)
     error_dn = np.sqrt(BLACK_DN / (40 * WIDTH / 2 * 3))
     np.testing.assert_allclose(stack.overscan_dn, [500, 460, 420], rtol=0, atol=4 * error_dn)
     np.testing.assert_array_equal(stack.frame(2, 0), load(sensor).frame(2, 0)[:, :88])

@@ -127,5 +127,5 @@ def test_time_spans_are_read_in_their_unit(tmp_path):
 
 def test_a_bayer_order_that_contradicts_the_file_is_told(tmp_path):
     np.savez(tmp_path / "a.npz", counts=frames(), exposure_s=1.0, cfa="RGGB")
-    with pytest.warns(UserWarning, match=r"cfa: .*a\.npz says RGGB; the given BGGR is taken instead"):
+    with pytest.warns(UserWarning, match=r"cfa: .*a\.npz says RGGB; the given BGGR is used instead"):
         assert hsnoise.load(tmp_path / "a.npz", cfa="BGGR").cfa == "BGGR"

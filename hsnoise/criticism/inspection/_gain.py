@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise._core.types import StatedGain
 from hsnoise.criticism.budget import BudgetRow, NoiseBudget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
@@ -141,5 +142,8 @@ def clipping(groups: Sequence[GroupFacts], white_known: bool) -> list[str]:
             said.append(f"Counts at {what}: {', '.join(named[:NAMED])}{more}")
     highest = {frame.highest_dn for g in groups for frame in g.frames if frame.highest_share > SATURATED}
     if not white_known and len(highest) == 1 and any(group.kind == "flat" for group in groups):
-        said.append(f"Many pixels end at {highest.pop()} DN: if that is where counts saturate, give it as white_level=")
+        said.append(
+            f"Many pixels end at {highest.pop()} DN: if that is where counts saturate, give it as"
+            f" {setting('white_level')}"
+        )
     return said

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.criticism.budget import NoiseBudget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 from hsnoise.criticism.inspection._gain import Gain
@@ -105,7 +106,10 @@ def _against_a_fit(
     if repeated and all(group.temporal_dn < 1e-3 for group in repeated):
         return "nothing changes from frame to frame", "Raw frames, at a higher gain if the noise is below one count."
     if is_mosaic:
-        return "a colour mosaic is read as mono", "The same frames with their Bayer order: cfa='RGGB', say."
+        return (
+            "a colour mosaic is read as mono",
+            f"The same frames with their Bayer order: {setting('cfa', 'RGGB')}, say.",
+        )
     return None
 
 

@@ -11,11 +11,13 @@ from hsnoise._core import html as _html
 from hsnoise._core.arguments import callback
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
+from hsnoise._core.naming import setting
 from hsnoise.criticism.budget import NoiseBudget, budget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.criticism.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.criticism.inspection._odd import odd_frames
 from hsnoise.criticism.inspection._verdict import about_growth, judged
+from hsnoise.frames.describing import levels_of, size_of
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.decomposition import COMPONENTS, Component
@@ -58,21 +60,20 @@ class Inspection:
         return Conclusion(Light.AMBER if self.findings else Light.GREEN, self.verdict)
 
     @property
-    def parts(self) -> dict[str, str]:
-        """What is printed, by name: the capture, its groups, what is odd, the budget, what can be had, what is next."""
-        head, levels, *_ = repr(self.stack).splitlines()
+    def parts(self) -> dict[str, tuple[str, ...]]:
+        """What is printed, in lines: the capture, its groups, what is odd, the budget, what can be had, what next."""
         return {
-            "capture": f"{head.replace('FrameStack: ', '')}\n{levels}",
-            "groups": "\n".join(_table(self.groups)),
+            "capture": (size_of(self.stack), f"  {levels_of(self.stack)}"),
+            "groups": _table(self.groups),
             "assumed": _listed("Read as", self.stack.assumed),
-            "odd": _listed("Odd", self.findings) or "Nothing odd was found.",
-            "budget": "\n".join(_noise_lines(self.budget)),
+            "odd": _listed("Odd", self.findings) or ("Nothing odd was found.",),
+            "budget": _noise_lines(self.budget),
             "determined": _listed("What can be determined", self.determined),
-            "next": f"Next: {self.next_capture}",
+            "next": (f"Next: {self.next_capture}",),
         }
 
     def __str__(self) -> str:
-        return "\n\n".join(part for part in (str(self.conclusion), *self.parts.values()) if part)
+        return "\n\n".join([str(self.conclusion), *("\n".join(part) for part in self.parts.values() if part)])
 
     __repr__ = __str__
 
@@ -86,11 +87,10 @@ class Inspection:
         return data_frame(self, columns, map(_numbers, self.groups))
 
     def _repr_html_(self) -> str:
-        head, levels, *_ = repr(self.stack).splitlines()
         title, heads, rows = _noise_table(self.budget)
         return _html.fragment(
             _html.conclusion(self.conclusion),
-            _html.paragraph(f"{head.replace('FrameStack: ', '')}, {levels.strip()}"),
+            _html.paragraph(f"{size_of(self.stack)}, {levels_of(self.stack)}"),
             _html.sentences(self.findings, "Odd:"),
             _html.table(HEADINGS, map(_cells, self.groups), words=("kind",)),
             _html.paragraph(f"Next: {self.next_capture}"),
@@ -136,7 +136,8 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
     ]
     if is_mosaic:
         findings.append(
-            "Read as mono, but the pixels of each 2 x 2 block differ: a colour sensor? Give cfa='RGGB', say"
+            "Read as mono, but the pixels of each 2 x 2 block differ: a colour sensor?"
+            f" Give {setting('cfa', 'RGGB')}, say"
         )
     return Inspection(
         stack=stack,
@@ -205,13 +206,13 @@ def _cells(group: GroupFacts) -> tuple[str, ...]:
     return kind, f"{exposure_s:.6g}", f"{n_frames}", temperature, f"{level_dn:.2f}", noise, f"+{hot_dn:.4g}"
 
 
-def _table(groups: tuple[GroupFacts, ...]) -> list[str]:
+def _table(groups: tuple[GroupFacts, ...]) -> tuple[str, ...]:
     """Headings and a line for each group, in columns as wide as the headings at least."""
     widths = [len(heading) for heading in HEADINGS[1:]]
-    return [
+    return tuple(
         f"{kind}   " + "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
         for kind, *cells in (HEADINGS, *map(_cells, groups))
-    ]
+    )
 
 
 def _noise_table(found: NoiseBudget | None) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
@@ -228,13 +229,13 @@ def _noise_table(found: NoiseBudget | None) -> tuple[str, tuple[str, ...], list[
     return f"Noise budget, standard deviations in DN{some}", heads, cells
 
 
-def _noise_lines(found: NoiseBudget | None) -> list[str]:
+def _noise_lines(found: NoiseBudget | None) -> tuple[str, ...]:
     title, heads, rows = _noise_table(found)
     if not rows:
-        return []
+        return ()
     width = max(22, *(len(name) + 2 for name, *_ in rows))
     lines = (f"{name:{width}}" + "".join(f"{cell:>16}" for cell in cells) for name, *cells in (heads, *rows))
-    return [f"{title}:", *lines]
+    return (f"{title}:", *lines)
 
 
 def _cell(component: Component) -> str:
@@ -246,5 +247,5 @@ def _cell(component: Component) -> str:
     return bound if value < 2 * error else f"{np.sqrt(value):.3g}"
 
 
-def _listed(title: str, sentences: tuple[str, ...]) -> str:
-    return "\n".join([f"{title}:", *(f"- {one}" for one in sentences)]) if sentences else ""
+def _listed(title: str, sentences: tuple[str, ...]) -> tuple[str, ...]:
+    return (f"{title}:", *(f"- {one}" for one in sentences)) if sentences else ()

@@ -1,4 +1,4 @@
 """Training of the enhancer and its evaluation: clips, noisy examples, steps, checkpoints, rivals.
 
-May import what `enhance` may.
+May import what `enhance` may import.
 """

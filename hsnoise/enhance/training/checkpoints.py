@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: the last two are kept, and one that was cut off gives way to the one before."""
+"""Checkpoints of a training run: the last two are kept, and a truncated one is replaced by the one before."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def path_of(folder: Path, step: int) -> Path:
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """Those of a folder, newest first."""
+    """The checkpoints in a folder, newest first."""
     return sorted(folder.glob("checkpoint-*.eqx"), reverse=True)
 
 
@@ -23,7 +23,7 @@ def write(folder: Path, step: int, tree: Any, about: dict[str, Any]) -> Path:
     """Write a checkpoint, then remove all but the last two.
 
     Raises:
-        OSError: the disk is full; the checkpoints before are left as they were.
+        OSError: the disk is full; earlier checkpoints are left as they were.
     """
     path = path_of(folder, step)
     try:
@@ -38,9 +38,9 @@ def write(folder: Path, step: int, tree: Any, about: dict[str, Any]) -> Path:
 
 
 def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]] | None:
-    """Tree and description of the newest checkpoint that is whole; None if there is none.
+    """Tree and description of the newest intact checkpoint; None if there is none.
 
-    A first one, before which there is nothing, may be cut off: then the run begins anew, and that is said.
+    If the only checkpoint is truncated, the run starts over, with a message.
 
     Raises:
         ValueError: there are several checkpoints, and none can be read.
@@ -50,7 +50,7 @@ def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]
         try:
             result = read_arrays(path, like)
         except ValueError as error:
-            instead = "taking the one before" if path != found[-1] else "there is none before it"
+            instead = "using the one before" if path != found[-1] else "there is none before it"
             say(f"{error}; {instead}")
             damaged.append(path)
             continue
@@ -59,11 +59,11 @@ def read_newest(folder: Path, like: Any, say=print) -> tuple[Any, dict[str, Any]
     if len(found) == 1:
         set_aside(damaged)
     elif found:
-        raise ValueError(f"{folder}: none of its {len(found)} checkpoints can be read; remove them to start anew")
+        raise ValueError(f"{folder}: none of its {len(found)} checkpoints can be read; remove them to start over")
     return None
 
 
 def set_aside(damaged: list[Path]) -> None:
-    """Rename them: else they would count as the last two."""
+    """Rename them; otherwise they would count as the last two."""
     for path in damaged:
         path.rename(path.with_suffix(".damaged"))

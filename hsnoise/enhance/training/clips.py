@@ -11,17 +11,17 @@ import numpy as np
 from hsnoise.enhance.video import frames_of, is_clip
 
 HELD_OUT_EVERY = 4
-LONG = "_long"  # name of a longer cut of the same video ends so
+LONG = "_long"  # suffix of the name of a longer cut of the same video
 STILLS = {"astronaut": "astronaut", "cells": "immunohistochemistry", "chelsea": "chelsea", "coffee": "coffee"}
 STILLS |= {"deep_field": "hubble_deep_field", "retina": "retina", "rocket": "rocket"}  # the fourth is held out
 MOVING_FRAMES, MOVING_CROP = 12, 192
 FASTEST = 3.0  # pixels a frame
-MOST_FRAMES = 300  # of a clip: longer videos are cut, they would not fit into memory
+MOST_FRAMES = 300  # of a clip: longer videos are cut to fit into memory
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A clean clip: frames [frame, row, column, 3] of uint8, display values."""
+    """A clean clip: frames [frame, row, column, 3] of uint8 display values."""
 
     name: str
     frames: np.ndarray
@@ -29,14 +29,24 @@ class Clip:
     @property
     def source(self) -> str:
         """The video that it was cut from."""
-        return self.name.removesuffix(LONG)
+        return source_of(self.name)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it is a longer cut of a video."""
+        return self.source != self.name
+
+
+def source_of(name: str) -> str:
+    """The video that a clip of this name was cut from."""
+    return name.removesuffix(LONG)
 
 
 def read_clips(folder: Path | None) -> list[Clip]:
-    """All clips of a folder, by name; without one, moving crops over scikit-image's pictures.
+    """All clips of a folder, sorted by name; without a folder, moving crops over scikit-image's pictures.
 
     Raises:
-        ValueError: no clips in the folder, or one that cannot be read.
+        ValueError: the folder has no clips, or one cannot be read.
     """
     if folder is None:
         return moving_stills()
@@ -60,24 +70,24 @@ def _first_frames(path: Path) -> np.ndarray:
 
 
 def held_out(clips: Sequence[Clip], fold: int = 0) -> tuple[list[Clip], list[Clip]]:
-    """(to train on, held out): every fourth video in the order of names, with all cuts of it; other ones in each fold.
+    """(to train on, held out): every fourth video by name is held out with all its cuts; each fold takes others.
 
     Raises:
         ValueError: fewer than two videos.
     """
     sources = sorted({clip.source for clip in clips})
     if len(sources) < 2:
-        raise ValueError(f"clips: expected at least two videos, one of them is held out; got {len(sources)}")
+        raise ValueError(f"clips: expected at least two videos, because one is held out; got {len(sources)}")
     every = min(HELD_OUT_EVERY, len(sources))
     kept = set(sources[(every - 1 - fold) % every :: every])
-    # A longer cut of a video shows nothing new to train on.
+    # A longer cut of a video adds nothing new to train on.
     names = {clip.name for clip in clips}
     train = [c for c in clips if c.source not in kept and (c.name == c.source or c.source not in names)]
     return train, [clip for clip in clips if clip.source in kept]
 
 
 def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
-    """Raise ValueError unless every clip has rows and columns of at least `side`, and half the frames or more."""
+    """Raise ValueError unless every clip has at least `side` rows and columns, and at least half the frames."""
     for clip in clips:
         n, rows, columns = clip.frames.shape[:3]
         if n < (frames + 1) // 2 or min(rows, columns) < side:
@@ -88,7 +98,7 @@ def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
 
 
 def moving_stills(seed: int = 0) -> list[Clip]:
-    """Crops that move over the pictures that come with scikit-image, at a steady speed of up to 3 pixels a frame."""
+    """Crops that move over scikit-image's pictures at a steady speed of up to 3 pixels a frame."""
     import skimage.data
 
     rng = np.random.default_rng(seed)
@@ -111,7 +121,7 @@ def _moved(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: int, side: int) -> np.ndarray:
     """Random pieces of random clips, mirrored at random: [batch, frame, row, column, 3] of uint8.
 
-    Of a clip that is shorter, all frames from a random one on, forth and back.
+    A shorter clip gives all its frames from a random one on, forth and back.
     """
     out = np.empty((batch, frames, side, side, 3), np.uint8)
     for i in range(batch):
@@ -131,7 +141,7 @@ def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: i
 
 
 def _places(length: int, frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Numbers of `frames` frames in a row; where the clip ends, they turn back."""
+    """Indices of `frames` consecutive frames, reversing at the ends of the clip."""
     if length >= frames:
         return rng.integers(length - frames + 1) + np.arange(frames)
     round_trip = np.concatenate([np.arange(length), np.arange(length - 2, 0, -1)])

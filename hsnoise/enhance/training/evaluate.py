@@ -1,4 +1,4 @@
-"""PSNR and SSIM of a trained enhancer on held-out clips, beside others: the command `hsnoise evaluate`."""
+"""PSNR and SSIM of a trained enhancer and its rivals on held-out clips: the command `hsnoise evaluate`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skimage.metrics import structural_similarity
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear, light_of_frames, linear_from_display
-from hsnoise.enhance.training.clips import LONG, Clip, check_sizes, held_out, read_clips
+from hsnoise.enhance.training.clips import Clip, check_sizes, held_out, read_clips, source_of
 from hsnoise.enhance.training.noisy import OPTICS, Camera, camera_of, noisy_of
 from hsnoise.enhance.training.rivals import Denoiser, denoised, not_installed, rivals, tuned
 from hsnoise.enhance.training.steps import digest_of
@@ -46,7 +46,7 @@ class Scene:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the noise in linear light, from frame to frame."""
+        """Standard deviation of the temporal noise in linear light."""
         noise = self.noisy - np.asarray(linear_from_display(self.clean))
         return float(np.sqrt(0.5 * np.mean(np.diff(noise, axis=0) ** 2)))
 
@@ -76,10 +76,10 @@ def scores(method: str, scene: Scene, found: np.ndarray) -> list[dict]:
 
 
 def camera_for(about: dict, options: argparse.Namespace) -> Camera:
-    """The camera and light to score with: those that the options say, else those that the weights were trained for.
+    """The camera and light to score with: as the options say, or else those that the weights were trained for.
 
     Raises:
-        ValueError: weights for a camera of which only its file would tell; else as `camera_of`.
+        ValueError: weights for a camera that is not built in, without its file; others as in `camera_of`.
     """
     name = options.camera or about.get("camera")
     if options.camera is None and name not in OPTICS:
@@ -90,27 +90,27 @@ def camera_for(about: dict, options: argparse.Namespace) -> Camera:
     sensor = options.sensor or (tuple(about["sensor"]) if about.get("sensor") else None)
     camera = replace(camera_of(name, options.lux, white_e, options.exposure), sensor=sensor)
     if about.get("digests", {}).get("camera") != digest_of(camera.model):
-        print(f"Note: {options.weights} was trained for another camera ({about.get('camera')}) than {camera.name}")
+        print(f"Note: {options.weights} was trained for another camera ({about.get('camera')}), not {camera.name}")
     return camera
 
 
 def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: Sequence[Clip]) -> None:
-    """Raise ValueError for weights of another number of channels, or trained on clips that are to be scored."""
+    """Raise ValueError for weights with a wrong number of channels, or trained on clips to be scored."""
     if net.channels != camera.channels:
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
     if "clips" not in about:
         print(f"Note: {path} does not say which clips it was trained on; those scored may be among them")
-    names, digests = ({n.removesuffix(LONG) for n in about.get("clips", ())}, about.get("trained_on", ()))
+    names, digests = (set(map(source_of, about.get("clips", ()))), about.get("trained_on", ()))
     seen = sorted({clip.source for clip in scored if clip.source in names or digest_of(clip.frames) in digests})
     if seen:
         raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
 
 
 def while_memory_fills(net, scene: Scene) -> list[float]:
-    """PSNR of the nth frame that the network sees, dB, n from 1: of the same frames for each n, whatever they show.
+    """PSNR of the nth frame that the network sees, dB, n from 1, on the same frames for each n.
 
-    The video, or what memory holds of a long one many times over, is begun anew at each frame; scored is its second
-    half.
+    The network starts over at each frame of the video (a long one is cut far beyond the network's memory). Only the
+    second half is scored.
     """
     n = min(len(scene.noisy), 2 * SHOWN_FRAMES[-1])
     most = (n + 1) // 2
@@ -131,7 +131,7 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict:
     for name, denoise in rivals().items() if untrained else ():
         strength, linear = tuned(denoise, tuning.noisy, tuning.clean, tuning.sigma)
         found[name] = partial(_of_scene, denoise, strength, linear)
-        print(f"{name}: best at {strength:g} times the noise, in {'linear light' if linear else 'display values'}")
+        print(f"{name}: best at {strength:g} times the noise in {'linear light' if linear else 'display values'}")
     return found
 
 
@@ -145,7 +145,7 @@ def mean_of(records: Sequence[dict], what: str, **chosen) -> float:
 
 
 def tables(records: list[dict], in_words) -> tuple[Sheet, Sheet]:
-    """PSNR and SSIM of each method, all and at each illuminance; PSNR of each clip."""
+    """PSNR and SSIM of each method, overall and at each illuminance; PSNR of each clip."""
     methods, levels = list(dict.fromkeys(r["method"] for r in records)), sorted({r["white_e"] for r in records})
     head = ("method", "PSNR / dB", "SSIM", *(f"dB / SSIM at {in_words(level)}" for level in levels))
     rows = [
@@ -167,7 +167,7 @@ def tables(records: list[dict], in_words) -> tuple[Sheet, Sheet]:
 
 
 def as_csv(records: list[dict]) -> str:
-    """All that was measured, a line for each frame."""
+    """All measurements, one row per frame."""
     file = io.StringIO()
     writer = csv.DictWriter(file, records[0], lineterminator="\n")
     writer.writeheader()
@@ -176,7 +176,7 @@ def as_csv(records: list[dict]) -> str:
 
 
 def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
-    """What the frames before are worth, for each clip."""
+    """How much the preceding frames help, for each clip."""
     shown = [n for n in SHOWN_FRAMES if n <= max(map(len, filling.values()))]
     rows = [(clip, *(f"{of[n - 1]:.2f}" if n <= len(of) else "" for n in shown)) for clip, of in filling.items()]
     title = "PSNR of the nth frame that the network sees, the same frames for each n, dB"
@@ -184,7 +184,7 @@ def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
 
 
 def draw_curves(records: list[dict], filling: dict[str, list[float]], in_words) -> Figure:
-    """PSNR against illuminance (all methods) and against the number of frames that the network has seen."""
+    """PSNR against illuminance (all methods), and against the number of frames that the network has seen."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     levels = sorted({r["white_e"] for r in records})
@@ -208,7 +208,7 @@ def draw_curves(records: list[dict], filling: dict[str, list[float]], in_words) 
 
 
 def draw_frames(scene: Scene, found: dict[str, np.ndarray], light: str) -> Figure:
-    """The last frame of a scene by all methods; light: of the scene, in words."""
+    """The last frame of a scene by all methods; light: the scene's light in words."""
     panels = {**found, "clean": scene.clean}
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
@@ -226,10 +226,10 @@ def draw_frames(scene: Scene, found: dict[str, np.ndarray], light: str) -> Figur
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score and write what was found to `options.out`.
+    """Score, and write the results to `options.out`.
 
     Raises:
-        ValueError: a crop that is too small for SSIM; weights, clips or a camera that do not go together.
+        ValueError: a crop too small for SSIM; weights, clips or a camera that do not match.
     """
     if options.crop < LEAST_CROP:
         raise ValueError(f"--crop: expected at least {LEAST_CROP} pixels, as SSIM needs, got {options.crop}")
@@ -247,7 +247,7 @@ def run(options: argparse.Namespace) -> None:
 
     middle = float(levels[LEVELS // 2])
     methods = methods_of(net, scene_of(train[0], camera, middle, options.crop, 99), not options.no_rivals)
-    short = [clip for clip in kept if not clip.name.endswith(LONG)]
+    short = [clip for clip in kept if not clip.is_long]
     tasks = [(clip, float(level)) for clip in short for level in levels]
     records = []
     for number, (clip, level) in enumerate(track(tasks, "Scoring", console=Console(stderr=True))):
@@ -260,7 +260,7 @@ def run(options: argparse.Namespace) -> None:
             )
     # Without longer cuts, the clips themselves show how the memory fills.
     filling = {}
-    for number, clip in enumerate([c for c in kept if c.name.endswith(LONG)] or short):
+    for number, clip in enumerate([clip for clip in kept if clip.is_long] or short):
         filling[clip.name] = while_memory_fills(net, scene_of(clip, camera, middle, options.crop, 1000 + number))
     sheets = (*tables(records, camera.in_words), memory_sheet(filling))
     for sheet in (sheets[0], sheets[-1]):

@@ -1,4 +1,4 @@
-"""Noisy frames of clean ones: light of a scene, what the camera makes of it, and simpler noise of the same strength."""
+"""Noisy frames from clean ones: the light of a scene, the camera's noise, and simpler noise of the same strength."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hsnoise.model import NoiseModel, sample
 from hsnoise.simulation import cameras
 from hsnoise.simulation.draws import black_level_of
 
-JITTER = 0.1  # rms, of the logarithm of each parameter that cannot be negative
+JITTER = 0.1  # rms, of the logarithm of each non-negative parameter
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
 LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons of white, or lux
 NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
@@ -28,7 +28,7 @@ Shape = tuple[int, int]
 
 @dataclass(frozen=True)
 class Optics:
-    """A camera's exposure and what turns the light of a scene into electrons, and its range in the paper (lux)."""
+    """A camera's exposure and optics, which turn a scene's light into electrons, and its range in the paper (lux)."""
 
     exposure_s: float
     f_number: float
@@ -37,7 +37,7 @@ class Optics:
     lux: tuple[float, float]
 
     def white_e(self, lux) -> ArrayLike:
-        """Photoelectrons of a pixel that sees a white surface in `lux`: the lens passes 1 / (4 N^2) of them."""
+        """Photoelectrons of a pixel that sees a white surface in `lux`; the lens passes 1 / (4 N^2) of the light."""
         return photoelectrons_from_illuminance(
             lux / (4 * self.f_number**2),
             exposure_s=self.exposure_s,
@@ -55,9 +55,9 @@ OPTICS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera to train for: its noise, photoelectrons of white in dim and in bright scenes, its optics if known.
+    """A camera to train for: its noise, photoelectrons of white in dim and bright scenes, and its optics if known.
 
-    sensor: rows and columns of its frames, of which those that are drawn are a piece; None: each is a frame.
+    sensor: rows and columns of its frames, from which pieces are drawn; None: each piece is a whole frame.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Camera:
         return len(self.model.channels)
 
     def in_words(self, white_e: float) -> str:
-        """The light of a scene in which white has so many photoelectrons."""
+        """The light of a scene in which white has `white_e` photoelectrons."""
         return f"{white_e:.2g} e-" if self.optics is None else f"{white_e / float(self.optics.white_e(1.0)):.2g} lux"
 
 
@@ -81,11 +81,11 @@ def camera_of(
     white_e: tuple[float, float] | None,
     exposure_s: float | None = None,
 ) -> Camera:
-    """A built-in camera, or that of a model.json with this exposure of a video frame (default: the model's own).
+    """A built-in camera, or the one in a model.json at this exposure of a video frame (default: the model's own).
 
     Raises:
         ValueError: an unknown camera or file; light that is missing, given twice or out of range; an exposure that is
-            not above 0, or goes with a built-in camera, which has its own.
+            not above 0, or given with a built-in camera, which has its own.
     """
     if lux is not None and white_e is not None:
         raise ValueError(f"--lux, --white-e: both say how much light there is; expected one, got {lux} and {white_e}")
@@ -97,7 +97,7 @@ def camera_of(
         raise ValueError(f"--camera: expected a model.json or one of {', '.join(OPTICS)}, got {name}")
     model = NoiseModel.load(name)
     if lux is not None or white_e is None:
-        raise ValueError("--white-e: needed with a model.json, which does not tell the optics that --lux needs")
+        raise ValueError("--white-e: needed with a model.json, which lacks the optics that --lux needs")
     if exposure_s is not None:
         if not 0 < exposure_s < np.inf:
             raise ValueError(f"--exposure: expected seconds above 0, got {exposure_s:g}")
@@ -114,7 +114,7 @@ def _built_in(name: str, lux: tuple[float, float] | None, white_e: tuple[float, 
 
 
 def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float]:
-    """Raise ValueError unless it is a range of light that a camera may see."""
+    """`light`; raises ValueError unless it is a plausible range."""
     low, high = light
     if not LEAST_LIGHT <= low <= high <= MOST_LIGHT:
         raise ValueError(f"{option}: expected low,high from {LEAST_LIGHT:g} to {MOST_LIGHT:g}, got {low:g},{high:g}")
@@ -122,17 +122,17 @@ def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float
 
 
 def at_exposure(model: NoiseModel, exposure_s: float) -> NoiseModel:
-    """`model` with this exposure where none is given, s."""
+    """`model` with this default exposure, s."""
     return NoiseModel(model.effects, cfa=model.cfa, shutter=model.shutter, exposure_s=exposure_s)
 
 
 def noise_of(kind: str, camera: Camera) -> NoiseModel:
-    """The noise to train on: the camera's own, a simpler one of the same strength, or that of a model.json.
+    """The noise to train on: the camera's own, simpler noise of the same strength, or that of a model.json.
 
     All at the camera's exposure.
 
     Raises:
-        ValueError: an unknown noise, or a model of other channels than the camera's.
+        ValueError: an unknown noise, or a model whose channels differ from the camera's.
     """
     if kind == "hsnoise":
         return camera.model
@@ -147,11 +147,11 @@ def noise_of(kind: str, camera: Camera) -> NoiseModel:
 
 
 def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: float | None = None) -> NoiseModel:
-    """Independent noise of the same variance in each pixel: that of the model's frames, or of `dark_variance_e2`.
+    """Independent noise with each pixel's variance in the model's frames, or in darks of `dark_variance_e2`.
 
-    "poisson-gaussian": shot noise, and read noise that makes up the variance of darks (so that variance against mean
-    is the same line, but for what row gain adds with the square of the light). "gaussian": one variance for all, that
-    at `light_e` photoelectrons.
+    "poisson-gaussian": shot noise plus read noise that makes up the variance of darks, so that variance against mean is
+    the same straight line except for the row gain's quadratic term. "gaussian": the variance at `light_e`
+    photoelectrons for all pixels.
     """
     light_e = light_e if kind == "gaussian" else 0.0
     variance_e2 = _variance_e2(model, light_e) if dark_variance_e2 is None else dark_variance_e2 + light_e
@@ -169,9 +169,9 @@ def matched(model: NoiseModel, kind: str, light_e: float, dark_variance_e2: floa
 
 
 def _variance_e2(model: NoiseModel, light_e: float) -> float:
-    """Temporal variance of sensor pixels in even light, mean over them, e-^2, from differences of frames."""
+    """Mean temporal variance of sensor pixels in uniform light, e-^2, from differences of frames."""
     light = np.full((MATCH_FRAMES, *MATCH_SHAPE), light_e, np.float32)
-    # Before clipping: the simpler noise is clipped, too.
+    # Before clipping, because the simpler noise is clipped as well.
     open_ended = model.remove("adc") if "adc" in model else model
     counts = np.asarray(sample(jax.random.key(0), light, open_ended), np.float64)
     tile = cfa_tile(model.cfa)
@@ -180,7 +180,7 @@ def _variance_e2(model: NoiseModel, light_e: float) -> float:
 
 
 def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseModel:
-    """`model` with other numbers, about 10 % off: cameras of one make differ, and so do fits."""
+    """`model` with parameters changed by about 10 %: cameras of one make differ, and so do fits."""
     for effect in model.effects:
         for field, spec in effect.specs().items():
             if spec.low != 0:
@@ -195,10 +195,10 @@ def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseMod
 def noisy_of(
     key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e, sensor: Shape | None = None
 ) -> jax.Array:
-    """What comes out of frames of light [frame, row, column, channel] (white is 1), in the same units.
+    """Noisy frames from frames of light [frame, row, column, channel] (white is 1), in the same units.
 
-    noise makes the counts; black level, gain and dark current of `camera` turn them back to light.
-    sensor: as in Camera; the frames lie at a random place of it. Raises ValueError if they are larger.
+    `noise` makes the counts; black level, gain and dark current of `camera` turn them back to light.
+    sensor: as in Camera; the frames lie at a random place on it. Raises ValueError if they are larger.
     """
     photons = mosaic(light * white_e, noise.cfa)
     window = None if sensor is None else _somewhere(named_key(key, "place"), photons.shape, sensor, noise.cfa)
@@ -206,7 +206,7 @@ def noisy_of(
 
 
 def _somewhere(key: jax.Array, shape: tuple[int, ...], sensor: Shape, cfa: str) -> tuple:
-    """A window for frames of `shape` at a random place of the sensor, where the Bayer pattern begins."""
+    """A window for frames of `shape` at a random place on the sensor that starts on a whole Bayer cell."""
     free = [most - size for most, size in zip(sensor, shape[-2:], strict=True)]
     if min(free) < 0:
         asked, came = (f"{rows} x {columns}" for rows, columns in (shape[-2:], sensor))

@@ -1,4 +1,4 @@
-"""What `hsnoise train` and `hsnoise evaluate` take; imports nothing that is slow to import."""
+"""Options of `hsnoise train` and `hsnoise evaluate`; imports nothing slow."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ TRAIN = """Train the video enhancer on clean clips and the noise of a camera.
     hsnoise train --preset paper --clips FOLDER          (a GPU)
     hsnoise train --camera hsnoise-fit/model.json --white-e 2,10
 
-Everything goes into --out: checkpoints, validation pictures, log.csv, and weights.eqx at the end. The same command
-goes on where an interrupted run stopped, and ends with the same weights.
+All output goes to --out: checkpoints, validation pictures, log.csv, and weights.eqx at the end. The same command
+resumes an interrupted run and ends with the same weights.
 """
-EVALUATE = """Score a trained enhancer: PSNR and SSIM on held-out clips, beside what users would take without training.
+EVALUATE = """Score a trained enhancer: PSNR and SSIM on held-out clips, compared with methods that need no training.
 
     hsnoise evaluate hsnoise-train/weights.eqx --clips FOLDER
 
 Writes a table and figures to --out: PSNR against illuminance and number of frames seen, frames side by side. BM3D
-and BM4D take part if the extra `peers` is installed; BM4D over the frame axis stands for VBM4D, which has no package.
+and BM4D are included if the extra `peers` is installed; BM4D over frames stands in for VBM4D, which has no package.
 """
 SENSOR = (
-    "of the camera's frames, for noise that depends on the place (glow, taps, shading): pieces lie"
-    " anywhere in them (default: each piece is a whole frame)"
+    "size of the camera's frames, for noise that depends on the place (glow, taps, shading): pieces"
+    " lie anywhere in them (default: each piece is a whole frame)"
 )
 
 
 def training_arguments(commands: Any) -> None:
-    """Add both commands to the subparsers of a parser."""
+    """Add both commands to a parser's subparsers."""
     raw = argparse.RawDescriptionHelpFormatter
     train = commands.add_parser("train", help="train the video enhancer", description=TRAIN, formatter_class=raw)
     _train_arguments(train)
@@ -44,7 +44,7 @@ def training_arguments(commands: Any) -> None:
 
 def _train_arguments(train: argparse.ArgumentParser) -> None:
     add = train.add_argument
-    add("--preset", choices=PRESETS, default="smoke", help="sizes of the run (default: smoke, which only tries it)")
+    add("--preset", choices=PRESETS, default="smoke", help="sizes of the run (default: smoke, a mere trial)")
     add("--camera", default="canon_5d3", help=f"model.json of a fit, or {', '.join(OPTICS)}")
     add("--noise", default="hsnoise", help=f"{', '.join(NOISES)} of the same strength, or a model.json")
     clips = "folder of videos, folders of images or .npz files (default: scikit-image's pictures)"
@@ -53,7 +53,7 @@ def _train_arguments(train: argparse.ArgumentParser) -> None:
     add("--sensor", type=shape_of, metavar="ROWSxCOLUMNS", help=SENSOR)
     vgg = "torchvision's VGG-16 weights (.safetensors or .pth) for the perceptual term"
     add("--vgg", type=Path, metavar="FILE", help=vgg)
-    add("--steps", type=int, metavar="N", help="instead of the preset's")
+    add("--steps", type=int, metavar="N", help="number of steps instead of the preset's")
     add("--seed", type=int, default=0, help="default: 0")
     add("--out", type=Path, default=Path("hsnoise-train"), metavar="FOLDER", help="default: hsnoise-train")
 
@@ -61,13 +61,16 @@ def _train_arguments(train: argparse.ArgumentParser) -> None:
 def _evaluate_arguments(evaluate: argparse.ArgumentParser) -> None:
     add = evaluate.add_argument
     add("weights", type=Path, metavar="WEIGHTS", help="weights.eqx of a training")
-    clips = "the folder that it was trained with; the clips held out then are used"
+    clips = "the folder that it was trained with; the clips that were held out are scored"
     add("--clips", type=Path, metavar="FOLDER", help=clips)
-    add("--camera", help=f"model.json of a fit, or {', '.join(OPTICS)} (default: the built-in one trained for)")
+    add(
+        "--camera",
+        help=f"model.json of a fit, or {', '.join(OPTICS)} (default: the built-in one that it was trained for)",
+    )
     _light_arguments(evaluate, "that of the training")
-    sensor = "of the camera's frames (default: that of the training)"
+    sensor = "size of the camera's frames (default: that of the training)"
     add("--sensor", type=shape_of, metavar="ROWSxCOLUMNS", help=sensor)
-    crop = "side of the middle of each frame that is scored (default 160)"
+    crop = "side of the central square of each frame that is scored (default 160)"
     add("--crop", type=int, default=160, metavar="PIXELS", help=crop)
     add("--no-rivals", action="store_true", help="score the enhancer and the scaled input only")
     add("--out", type=Path, default=Path("hsnoise-evaluate"), metavar="FOLDER", help="default: hsnoise-evaluate")
@@ -76,13 +79,13 @@ def _evaluate_arguments(evaluate: argparse.ArgumentParser) -> None:
 def _light_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     add = parser.add_argument
     add("--lux", type=pair, metavar="LOW,HIGH", help=f"illuminance of the scene (default: {default})")
-    add("--white-e", type=pair, metavar="LOW,HIGH", help="or photoelectrons of white")
-    exposure = "of a video frame, s, with a model.json (default: the model's own)"
+    add("--white-e", type=pair, metavar="LOW,HIGH", help="instead of --lux: photoelectrons of white")
+    exposure = "exposure of a video frame, s, with a model.json (default: the model's own)"
     add("--exposure", type=seconds, metavar="S", help=exposure)
 
 
 def pair(text: str) -> tuple[float, float]:
-    """Low and high of 2,10; of one number it is both."""
+    """Low and high from 2,10; a single number is both."""
     try:
         low, _, high = text.partition(",")
         return float(low), float(high or low)
@@ -91,7 +94,7 @@ def pair(text: str) -> tuple[float, float]:
 
 
 def shape_of(text: str) -> tuple[int, int]:
-    """Rows and columns of 3000x4000."""
+    """Rows and columns from 3000x4000."""
     rows, _, columns = text.lower().partition("x")
     if not (rows.isdecimal() and columns.isdecimal() and int(rows) and int(columns)):
         raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS such as 480x640, got {text!r}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Recipe:
-    """Network and optimiser. decay: the rate falls to 0 by a cosine, as short runs need; else it stays."""
+    """Network and optimiser. decay: the learning rate falls to 0 by a cosine, as short runs need; else constant."""
 
     maps: int = 64
     kernels: tuple[int, ...] = (3, 5, 5, 3)
@@ -30,7 +30,7 @@ class Preset:
 
 
 PRESETS = {
-    # In this little light details of less than 4 pixels are lost: coarse blocks see four times the scene in the time.
+    # In so little light, details below 4 pixels are lost: coarse blocks see four times the scene in the same time.
     "smoke": Preset(200, 4, 4, 64, 100, Recipe(maps=8, stride=4, rate=5e-3)),
     "cpu": Preset(4_400, 4, 12, 64, 500, Recipe(maps=16, stride=4, rate=2e-3)),
     "paper": Preset(100_000, 8, 8, 64, 1000, Recipe(maps=64, decay=False)),

@@ -1,7 +1,7 @@
-"""What users would take without training: the scaled frame, non-local means, total variation, BM3D, BM4D.
+"""Methods that need no training: the scaled frame, non-local means, total variation, BM3D, BM4D.
 
-Each gets the true noise of the frames (its standard deviation in flat places), one of several strengths and the domain,
-linear light or display values, in which it does best on a clip that is not scored.
+Each gets the true noise of the frames (the standard deviation in flat areas), and the strength and the domain (linear
+light or display values) that do best on a clip that is not scored.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ PEERS: dict[str, tuple[str, Denoiser]] = {
 
 
 def rivals() -> dict[str, Denoiser]:
-    """By name; BM3D and BM4D if their packages (extra `peers`) are installed."""
+    """All methods by name; BM3D and BM4D only if their packages (extra `peers`) are installed."""
     found: dict[str, Denoiser] = {
         "non-local means": partial(_frame_by_frame, _non_local_means),
         "total variation": partial(_frame_by_frame, _total_variation),
@@ -72,7 +72,7 @@ def denoised(denoise: Denoiser, noisy: np.ndarray, sigma: float, strength: float
     if linear:
         return np.asarray(display_from_linear(denoise(noisy.astype(float), strength * sigma)))
     shown = np.clip(np.asarray(display_from_linear(noisy)), 0, 1)
-    # The display curve and the clipping change the noise: measured again, as a user would.
+    # The display curve and clipping change the noise: measure it again, as a user would.
     apart = np.diff(shown, axis=0)
     return denoise(shown.astype(float), strength * float(np.sqrt(0.5 * np.mean(apart**2))))
 

@@ -1,4 +1,4 @@
-"""Steps of training: noise drawn on the fly, gradient, Adam. The same step of the same seed is always the same."""
+"""Training steps: noise drawn on the fly, gradient, Adam. A step depends only on the seed and its number."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from hsnoise.stlstm import STLSTM, loss
 
 
 def batch_rng(seed: int, step: int) -> np.random.Generator:
-    """Of the crops of one step: a resumed run takes those that an uninterrupted one takes."""
+    """Generator for the crops of one step: a resumed run takes the same crops as an uninterrupted one."""
     return np.random.default_rng([seed, step])
 
 
 def digest_of(*trees: Any) -> str:
-    """A hash of all that is in them: names of what things are, and numbers."""
+    """A hash of everything in them: structure and numbers."""
     found = hashlib.sha256(str(jax.tree.structure(trees)).encode())
     for leaf in jax.tree.leaves(trees):
         found.update(np.asarray(leaf).tobytes())
@@ -36,7 +36,7 @@ def digest_of(*trees: Any) -> str:
 
 
 class Trainer:
-    """A network, its optimiser, and the jitted step; the state is (arrays of the network, of the optimiser)."""
+    """A network, its optimiser and the jitted step; the state is (network arrays, optimiser state)."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Trainer:
         perceptual: Callable | None = None,
         jitter: float = JITTER,
     ):
-        # Fits are in double precision, training is not.
+        # Fits use double precision, training does not.
         single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
         self.recipe, self.camera, self.noise = recipe, replace(camera, model=single(camera.model)), single(noise)
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
@@ -76,7 +76,7 @@ class Trainer:
 
 
 def sharding_of_batches() -> jax.sharding.NamedSharding | None:
-    """Examples over all devices; None if there is one."""
+    """Examples spread over all devices; None if there is only one."""
     devices = np.array(jax.devices())
     if len(devices) == 1:
         return None
@@ -107,7 +107,7 @@ def examples(
 ) -> tuple[jax.Array, jax.Array]:
     """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
 
-    Each example has a camera of its own, off by `jitter`, a scene between the photoelectrons of white `light`, and a
+    Each example has its own camera, changed by `jitter`, its own photoelectrons of white within `light`, and its own
     place on the sensor, as in Camera.
     """
     linear = light_of_frames(batch, len(camera.channels))

@@ -1,7 +1,7 @@
-"""A training run of the video enhancer, which can be interrupted: the command `hsnoise train`.
+"""A training run of the video enhancer that can be interrupted: the command `hsnoise train`.
 
-Everything goes into `--out`: checkpoints, validation pictures, log.csv, and weights.eqx at the end. The same command
-goes on where an interrupted run stopped, and ends with the same weights.
+All output goes to `--out`: checkpoints, validation pictures, log.csv, and weights.eqx at the end. The same command
+resumes an interrupted run and ends with the same weights.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ MOST_SEED = 2**32 - 1
 
 
 def run(options: argparse.Namespace, console: Console) -> Path:
-    """Train, or go on training; returns the weights file.
+    """Train, or resume training; returns the weights file.
 
     Raises:
-        ValueError: an option that is out of range, another run in the same folder, a loss that is no number.
+        ValueError: an option out of range, another run in the same folder, a loss that is not finite.
     """
     if not 0 <= options.seed <= MOST_SEED:
         raise ValueError(f"--seed: expected 0 to {MOST_SEED}, got {options.seed}")
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     if found is not None:
         check_same(options.out, found[1], about)
         state, first = found[0], found[1]["step"]
-        console.print(f"Going on from step {first}")
+        console.print(f"Resuming from step {first}")
     write_atomically(options.out / DESCRIBED, (json.dumps(about, indent=2) + "\n").encode())
     state = loop(trainer, state, first, preset, train, validation, about, options, console)
     if math.isnan(validation.last):  # nothing was left to train
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace, console: Console) -> Path:
 
 
 def description(preset: Preset, camera, noise, train, kept, options: argparse.Namespace) -> dict:
-    """What makes a run the one that it is, in words that JSON can hold."""
+    """Everything that defines a run, in types that JSON can hold."""
     return {
         "preset": json.loads(json.dumps(asdict(preset))),
         "camera": camera.name,
@@ -97,9 +97,9 @@ def description(preset: Preset, camera, noise, train, kept, options: argparse.Na
 
 
 def loop(trainer, state, first, preset, clips, validation, about, options, console):
-    """All steps from `first` on, with checkpoints and validation; an interrupted one is kept where it stopped."""
+    """All steps from `first` on, with checkpoints and validation; an interrupt saves a checkpoint."""
     saved, saved_at = time.monotonic(), first
-    at = (first, state, 0.0)  # in one piece: an interrupt must not come between a step and its number
+    at = (first, state, 0.0)  # one tuple: an interrupt must not separate a state from its number
     try:
         with ProgressOfTraining(console, preset.steps, first) as progress:
             for step in range(first, preset.steps):
@@ -120,13 +120,13 @@ def loop(trainer, state, first, preset, clips, validation, about, options, conso
     except KeyboardInterrupt:
         if at[0] > saved_at and math.isfinite(at[2]):
             checkpoints.write(options.out, at[0], at[1], about)
-        console.print("Interrupted; the same command goes on where it stopped")
+        console.print("Interrupted; the same command resumes here")
         raise
     return at[1]
 
 
 def checked_loss(value, step: int) -> float:
-    """The loss as a number. Raises ValueError if it is none, from which no step leads back."""
+    """The loss as a number. Raises ValueError unless it is finite, because training cannot recover from that."""
     if not math.isfinite(value):
         raise ValueError(
             f"step {step}: the loss is {float(value)}; is the light, or a number of the camera, out of range?"
@@ -135,7 +135,7 @@ def checked_loss(value, step: int) -> float:
 
 
 class ProgressOfTraining:
-    """A bar in a terminal; lines of text where there is none."""
+    """A bar in a terminal, lines of text elsewhere."""
 
     def __init__(self, console: Console, steps: int, first: int):
         text = "{task.description}  loss {task.fields[loss]}  PSNR {task.fields[psnr]} dB  {task.fields[speed]} steps/s"
@@ -152,21 +152,21 @@ class ProgressOfTraining:
         self._bar.stop()
 
     def show(self, done: int, loss: float) -> None:
-        """A few steps more, and the loss of the last."""
+        """Show the number of steps done, and the loss of the last."""
         now, (then, before) = time.monotonic(), self._mark
         speed = (done - before) / max(now - then, 1e-9)
         self._mark = (now, done)
         self._bar.update(self._task, completed=done, loss=f"{loss:.4f}", speed=f"{speed:.1f}")
 
     def tell(self, done: int, loss: float, psnr: float, refer: float) -> None:
-        """What the validation found, dB."""
+        """Print the result of the validation, dB."""
         self._bar.update(self._task, psnr=f"{psnr:.2f}")
         if not self._console.is_terminal:
             self._console.print(f"step {done}: loss {loss:.4f}, PSNR {psnr:.2f} dB (input {refer:.2f})")
 
 
 def append_log(path: Path, step: int, value: float, psnr: float, refer: float) -> None:
-    """One more row of the log; rows of steps that a resumed run repeats, and damaged ones, are left out."""
+    """Add a row to the log; drop damaged rows, and rows of steps that a resumed run repeats."""
     rows = list(csv.reader(path.read_text(errors="replace").splitlines()))[1:] if path.exists() else []
     rows = [row for row in rows if len(row) == len(LOGGED) and row[0].isdecimal() and int(row[0]) < step]
     rows.append([str(step), f"{value:.6f}", f"{psnr:.4f}", f"{refer:.4f}"])
@@ -183,7 +183,7 @@ def chosen_preset(options: argparse.Namespace) -> Preset:
 
 
 def perceptual_of(path: Path | None, console: Console):
-    """Features for the perceptual term and the hash of their weights; the first line of the log says which."""
+    """Features for the perceptual term, and the hash of their weights; prints which are used."""
     if path is None:
         console.print("Perceptual term of the loss: off, no VGG-16 weights given (--vgg)")
         return None, None
@@ -193,7 +193,7 @@ def perceptual_of(path: Path | None, console: Console):
 
 
 def check_same_run(out: Path, about: dict) -> None:
-    """Raise ValueError if the folder `out`, which is made, holds another run."""
+    """Raise ValueError if the folder `out`, which is created if missing, holds another run."""
     path = out / DESCRIBED
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out: expected a folder, but {out} is a file")
@@ -202,12 +202,12 @@ def check_same_run(out: Path, about: dict) -> None:
         try:
             before = dict(json.loads(path.read_text()))
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path}: damaged ({error}); remove it, the checkpoints tell what the run is") from error
+            raise ValueError(f"{path}: damaged ({error}); remove it, the checkpoints describe the run, too") from error
         check_same(out, before, about)
 
 
 def check_same(out: Path, before: dict, about: dict) -> None:
-    """Raise ValueError if what a run in `out` says of itself is not `about`."""
+    """Raise ValueError unless the run in `out`, described by `before`, is the one that `about` describes."""
     changed = [name for name in about if about[name] != before.get(name)]
     if changed:
         raise ValueError(
@@ -216,7 +216,7 @@ def check_same(out: Path, before: dict, about: dict) -> None:
 
 
 def has_ended(path: Path, about: dict) -> bool:
-    """Whether `path` holds the weights at the end of this run."""
+    """Whether `path` holds the final weights of this run."""
     try:
         found = load_network(path)[1]
     except (OSError, ValueError):

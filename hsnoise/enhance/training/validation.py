@@ -1,4 +1,4 @@
-"""How good an enhancer is while it is trained: PSNR on held-out clips, and a picture of them."""
+"""The quality of an enhancer during training: PSNR on held-out clips, and a picture of them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ MOST_CLIPS = 4
 
 
 def psnr_db(found: np.ndarray, clean: np.ndarray) -> float:
-    """Peak signal to noise of display values, clipped to 0 to 1, over all that is given."""
+    """Peak signal-to-noise ratio of display values, clipped to 0 to 1, over whole arrays."""
     return float(-10 * np.log10(max(np.mean((np.clip(found, 0, 1) - clean) ** 2), 1e-12)))
 
 
 class Validation:
-    """Crops from the middle of held-out clips in the middle of the light range, always with the same noise."""
+    """Central crops of held-out clips in the middle of the light range, always with the same noise."""
 
     def __init__(self, clips: Sequence[Clip], camera: Camera, frames: int, out: Path):
         self.out, self.last = out, float("nan")

@@ -14,18 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Places of the convolutions up to relu2_2 in torchvision's `features`, inputs and outputs; a pool follows the second.
+# Convolutions up to relu2_2: position in torchvision's `features`, inputs, outputs; a pool follows the second.
 LAYERS = ((0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128))
 POOL_AFTER = 2
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what torchvision's weights expect of display values
-KNOWN = {"397923af": "VGG16_Weights.IMAGENET1K_V1"}  # torchvision puts the hash's start into the file name
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # torchvision's normalisation
+KNOWN = {"397923af": "VGG16_Weights.IMAGENET1K_V1"}  # torchvision's file names hold the start of the hash
 
 
 def read_weights(path: Path) -> tuple[dict[str, np.ndarray], str]:
     """State dict of torchvision's VGG-16 (.safetensors, or .pth, which needs torch), and SHA-256 of the file.
 
     Raises:
-        ValueError: an unknown format, a file that cannot be read, or arrays that are missing, of other shapes or not
+        ValueError: an unknown format, a file that cannot be read, or arrays that are missing, of wrong shape or not
             finite.
         ImportError: the library that reads the format is not installed.
     """
@@ -41,7 +41,7 @@ def read_weights(path: Path) -> tuple[dict[str, np.ndarray], str]:
         state = {name: np.asarray(state[name], np.float32) for name in shapes if name in state}
     except ImportError:
         raise
-    except Exception as error:  # pickles and archives fail in as many ways as they have bytes
+    except Exception as error:  # pickles and archives can fail in countless ways
         raise ValueError(f"--vgg: {path} cannot be read ({type(error).__name__}: {error})") from error
     for name, shape in shapes.items():
         found = state[name].shape if name in state else "nothing"
@@ -95,5 +95,5 @@ def features_of(state: dict[str, np.ndarray]) -> Callable[[jax.Array], jax.Array
 
 
 def name_of(digest: str) -> str:
-    """What is known of a file by its hash."""
+    """The name of known weights by their hash."""
     return KNOWN.get(digest[:8], f"weights of unknown origin, SHA-256 {digest[:8]}")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import result_of
-from hsnoise.fitting.result import FitResult
-from hsnoise.likelihood.summary import Summary
+from hsnoise.fitting.result import FitResult, Method, Status
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
@@ -41,20 +42,21 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
     pixel = seen.darks
     if not pixel.determined:
         return result
-    if result.method == "line":
-        failed = "NOT CONVERGE" in result.outcome
-        return _instead(result.outcome, pixel, summary, model, result) if failed else result
-    gain, error = np.asarray(result.physics.gain), _gain_errors(result)
+    other = partial(result_of, pixel, summary, model, result.stack)
+    if result.method == Method.LINE:
+        failed = result.status == Status.LINE_INSTEAD
+        return replace(other(), status=Status.TRANSFER_INSTEAD, detail=result.detail) if failed else result
+    gain, error = np.asarray(result.params["gain"].value), _gain_errors(result)
     off = np.abs(gain - pixel.estimate[: len(gain)])
     apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)
     if not apart.any():
         return result
-    why = f"THE LIKELIHOOD'S GAIN, {gain[apart][0]:.3g} DN/e-, DISAGREES WITH PIXELS OVER TIME"
-    return _instead(why, pixel, summary, model, result)
+    return replace(other(), status=Status.CONTRADICTED, detail=f"{gain[apart][0]:.3g} DN/e-")
 
 
 def _gain_errors(result: FitResult) -> np.ndarray:
-    return np.array([row[1] for name, row in result.table.items() if name.split(".")[0] == "gain"])
+    table = result.table
+    return np.array([table[number.name][1] for number in numbers_of(result.params, ["gain"])])
 
 
 def _errors(pixel: PixelFit) -> np.ndarray:
@@ -64,8 +66,3 @@ def _errors(pixel: PixelFit) -> np.ndarray:
 def _grows(pixel: PixelFit) -> bool:
     """Whether variance or mean of some colour grows with exposure beyond chance."""
     return any(c.values[2] > 3 * np.sqrt(c.covariance[2, 2]) for c in pixel.channels)
-
-
-def _instead(why: str, pixel: PixelFit, summary: Summary, model, result: FitResult) -> FitResult:
-    other = result_of(pixel, summary, model, result.stack)
-    return replace(other, outcome=f"{why.partition(';')[0]}; pixel transfer instead")

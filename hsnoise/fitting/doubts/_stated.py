@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.flat_notes import stated_gain_note
-from hsnoise.fitting.result import FitResult
-from hsnoise.frames.mosaics import MOSAIC, looks_like_a_mosaic
+from hsnoise.fitting.result import FitResult, Method
+from hsnoise.frames.mosaics import looks_like_a_mosaic, mosaic_in_words
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.survey import Group
 
@@ -32,7 +33,7 @@ def header_gain(result: FitResult) -> Iterator[str]:
     """A gain that the header states, against the fitted one; where it may be a nominal one, the frames are believed."""
     if result.stack is None or not result.has_gain:
         return
-    rows = [row for name, row in result.table.items() if name.split(".")[0] == "gain"]
+    rows = list(result.rows_of("gain").values())
     value, error = (float(np.mean([row[i] for row in rows])) for i in (0, 1))
     yield from stated_gain_note(result.stack.stated_gain, value, error)
 
@@ -40,7 +41,7 @@ def header_gain(result: FitResult) -> Iterator[str]:
 def _black_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     """A black level that was given, against the level of the darks without signal."""
     given = result.summary.black_level_dn
-    if given is None or result.transfer is None and result.method != "ml" or not seen.survey.has_exposures:
+    if given is None or result.transfer is None and result.method != Method.ML or not seen.survey.has_exposures:
         return
     pixel = result.transfer if result.transfer is not None else seen.darks
     darks = seen.survey.darks
@@ -72,7 +73,7 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     if above > 0:
         yield (
             f"{100 * above:.2g} % of the pixels hold counts above the white level, which was given as {given:g} DN, up"
-            f" to {top:g}: it is higher. Leave it out, or give white_level={top:g}."
+            f" to {top:g}: it is higher. Leave it out, or give {setting('white_level', top)}."
         )
         return
     piled = int((highest == top).sum())
@@ -80,7 +81,9 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     if piled < max(FEWEST_PILED, PILED * below) or top >= (seen.survey.full_scale_dn if given is None else given) - 1:
         return
     what = "no white level was given" if given is None else f"the white level was given as {given:g} DN"
-    yield f"{piled} of the pixels looked at end at a count of {top:g} DN, and {what}: give white_level={top:g}."
+    yield (
+        f"{piled} of the pixels looked at end at a count of {top:g} DN, and {what}: give {setting('white_level', top)}."
+    )
 
 
 def _highest(group: Group, moving: list[np.ndarray]) -> np.ndarray:
@@ -96,7 +99,7 @@ def _mosaic(result: FitResult, seen: Evidence) -> Iterator[str]:
         return
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
     if looks_like_a_mosaic(stack.frame(max(darks, key=lambda i: stack.exposure_s[i]), 0)):
-        yield f"The frames are {MOSAIC}."
+        yield f"The frames are {mosaic_in_words()}."
 
 
 def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:

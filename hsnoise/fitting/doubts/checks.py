@@ -20,7 +20,8 @@ from hsnoise.fitting.flat_notes import gain_notes
 from hsnoise.fitting.notes import order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import in_electrons
-from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.result import FitResult, Method
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
@@ -55,7 +56,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
     notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
@@ -63,10 +64,11 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
 
 def _without_open_gain(result: FitResult) -> FitResult:
     """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
-    gains = [(value, error) for name, (value, error, _) in result.table.items() if name.split(".")[0] == "gain"]
-    if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error in gains):
+    table, numbers = result.table, numbers_of(result.params)
+    gains = [table[number.name] for number in numbers if number.effect == "gain"]
+    if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error, _ in gains):
         return result
-    names = tuple(name for name in result.params.table if in_electrons(name))
+    names = tuple(number.name for number in numbers if in_electrons(number))
     return replace(result, withheld=tuple(dict.fromkeys((*result.withheld, *names))))
 
 
@@ -76,7 +78,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         return
     pixel: PixelFit | None = result.transfer
     if pixel is None:
-        read_dn = float(np.mean(np.asarray(result.physics.gain)) * result.physics.read_noise)
+        read_dn = float(np.mean(result.params["gain"].value)) * float(result.params["read_noise"].sigma)
         yield f"The gain is not determined: nothing in these darks tells it. Read noise is {read_dn:.4g} DN. {ADD}"
         return
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
@@ -228,7 +230,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
     bounds = [plane.narrow_dn[1] for plane in planes if plane.narrow_dn]
     if not bounds or not np.isfinite(max(bounds)):
         return
-    bound, gain = max(bounds), float(np.mean(np.asarray(result.physics.gain)))
+    bound, gain = max(bounds), float(np.mean(result.params["gain"].value))
     electrons = f", {bound / gain:.3g} e-" if result.has_gain else ""
     yield (
         f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
@@ -238,7 +240,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
 
 def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
     """Static structure that a fit by pooled histograms takes for noise."""
-    if result.method == "transfer":
+    if result.method == Method.TRANSFER:
         return
     worst = 0.0
     for c in range(len(found.channels)):

@@ -1,4 +1,4 @@
-"""Readers, one file format a module, and how files are sorted into a capture: `load`.
+"""Readers, one module per file format, and `load`, which sorts files into a capture.
 
-May import `_core` and the modules of `frames` beside it.
+May import `_core` and the other modules of `frames`.
 """

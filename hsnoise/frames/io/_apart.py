@@ -1,4 +1,4 @@
-"""Frames that do not belong with the others: set apart, and named."""
+"""Setting aside frames that do not belong with the others, and naming them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.io._kinds import folder_of, frames, names_of
 from hsnoise.frames.io._recording import Recording
 
-SAME_TEMPERATURE_K = 4.0  # offset and dark current of frames closer than this are taken for the same
-BINNED = (2, 3, 4)  # sides that differ by such a factor are those of binned frames
-THIN = 16  # every such row and column tells whether counts are integers
+SAME_TEMPERATURE_K = 4.0  # frames closer than this are assumed to share offset and dark current
+BINNED = (2, 3, 4)  # frames whose sides differ by one of these factors are binned
+THIN = 16  # one in so many rows and columns shows whether counts are integers
 
-Reasons = dict[int, tuple[str, str]]  # by index, what sets recordings apart ("of ISO 100") and from what
+Reasons = dict[int, tuple[str, str]]  # by index: how a recording differs ("of ISO 100"), and from what
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """Recordings of one place on the sensor, flats of another crop, and sentences about what was set aside."""
+    """Recordings of one region of the sensor, flats of another crop, and sentences about what was set aside."""
 
     main: list[Recording]
     elsewhere: list[Recording]
@@ -29,10 +30,10 @@ class Sorted:
 
 
 def sort_out(read: Sequence[Recording], root: Path) -> Sorted:
-    """Lights, masters, and frames of another size, binning, gain, ISO, CFA or temperature set aside.
+    """Set aside lights, masters, and frames of another size, binning, gain, ISO, CFA or temperature.
 
     Raises:
-        ValueError: nothing is left, or as many frames are of one size, gain or ISO as of another.
+        ValueError: nothing is left, or two sizes, gains or ISOs have equally many frames.
     """
     kept, told = list(read), []
     rules: list[Callable[[list[Recording]], Reasons]] = [
@@ -49,13 +50,15 @@ def sort_out(read: Sequence[Recording], root: Path) -> Sorted:
         told += _sentences(kept, reasons, root)
         kept = [recording for i, recording in enumerate(kept) if i not in reasons]
         if not kept:
-            raise ValueError(f"path: no dark and no flat frames: {'; '.join(told)}; give kind= if they are")
+            raise ValueError(
+                f"{named('path')}: no dark and no flat frames: {'; '.join(told)}; give {setting('kind')} if they are"
+            )
     size = _main_size(kept)
     return Sorted([r for r in kept if r.size == size], [r for r in kept if r.size != size], told)
 
 
 def _sentences(read: Sequence[Recording], reasons: Reasons, root: Path) -> list[str]:
-    """One sentence for all frames of a folder that have one reason."""
+    """One sentence for all frames of a folder that were set aside for the same reason."""
     groups: Counter[tuple[str, str, str]] = Counter()
     for i, (what, why) in reasons.items():
         groups[what, folder_of(read[i].path, root), why] += read[i].n_frames
@@ -85,7 +88,7 @@ def _is_master(recording: Recording, root: Path) -> bool:
 
 
 def _of_other_size(read: list[Recording]) -> Reasons:
-    """Frames of another size than most darks (or flats, if there are none), but for flats of another crop."""
+    """Frames of another size than most darks (or flats, if no darks), except flats of another crop."""
     size = _main_size(read)
     binning = _most_common([r for r in read if r.size == size], lambda r: r.binning)
     crops = [r for r in read if r.size != size and r.kind == "flat" and not _is_binned(r, size, binning)]
@@ -102,7 +105,7 @@ def _of_other_size(read: list[Recording]) -> Reasons:
 
 
 def _main_size(read: Sequence[Recording]) -> tuple[int, int]:
-    """Size of most darks; where two sizes have as many, that of most frames. Raises ValueError if these do, too."""
+    """Size of most darks; on a tie, the size of most frames. Raises ValueError if that is a tie, too."""
     darks = [r for r in read if r.kind == "dark"] or read
     tied = _tied(darks, lambda r: r.size)
     if len(tied) > 1:
@@ -110,8 +113,8 @@ def _main_size(read: Sequence[Recording]) -> tuple[int, int]:
     if len(tied) > 1:
         one, two = (next(r for r in read if r.size == size) for size in tied[:2])
         raise ValueError(
-            f"{two.path}: frames of {two.size} pixels, those of {one.path} have {one.size}, and of either there are as"
-            " many; all frames must have one size"
+            f"{two.path}: frames of {two.size} pixels, those of {one.path} have {one.size}, and there are equally many"
+            " of both; all frames must have one size"
         )
     return tied[0]
 
@@ -124,12 +127,12 @@ def _is_binned(recording: Recording, size: tuple[int, int], binning: tuple[int, 
 
 
 def _of_other(name: str, words: str, read: list[Recording]) -> Reasons:
-    """Frames whose `name` is known and differs from that of most. Raises ValueError if there is no most."""
+    """Frames whose `name` is known and differs from the majority's. Raises ValueError without a majority."""
     known = [r for r in read if getattr(r, name) is not None]
     tied = _tied(known, lambda r: getattr(r, name))
     if len(tied) > 1:
         one, two = (next(r for r in known if getattr(r, name) == value) for value in tied[:2])
-        hint = "load them separately" if name != "cfa" else "give cfa= or load them separately"
+        hint = "load them separately" if name != "cfa" else f"give {setting('cfa')} or load them separately"
         raise ValueError(f"{one.path} and {two.path} differ in {name}: {tied[0]} and {tied[1]}; {hint}")
     return {
         i: (f" of {words.format(getattr(r, name))}", f"the others have {words.format(tied[0])}")
@@ -139,7 +142,7 @@ def _of_other(name: str, words: str, read: list[Recording]) -> Reasons:
 
 
 def _of_other_temperature(read: list[Recording]) -> Reasons:
-    """Frames further than SAME_TEMPERATURE_K from the temperature that most frames of their kind are close to."""
+    """Frames more than SAME_TEMPERATURE_K from the temperature of most frames of their kind."""
     reasons = {}
     for kind in ("dark", "flat"):
         known = [(i, r) for i, r in enumerate(read) if r.kind == kind and r.temperature_c is not None]
@@ -155,7 +158,7 @@ def _of_other_temperature(read: list[Recording]) -> Reasons:
 
 
 def _tied(read: Sequence[Recording], key: Callable[[Recording], Hashable]) -> list:
-    """The value that most frames have, or those that as many have."""
+    """The value that most frames have; on a tie, all such values."""
     n: Counter[Hashable] = Counter()
     for recording in read:
         n[key(recording)] += recording.n_frames

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsnoise._core.arguments import numbers, span
+from hsnoise._core.naming import named, setting
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.bayer import shift_cfa
 from hsnoise.frames.io import _emva
@@ -33,7 +34,7 @@ from hsnoise.frames.joining import replaced
 from hsnoise.frames.lazy import crop
 from hsnoise.frames.stack import FrameStack
 
-_LONG_READ = 16  # files from which on a progress bar is shown
+_LONG_READ = 16  # files; from here on a progress bar is shown
 
 Groups = list[list[Recording]]
 
@@ -41,7 +42,7 @@ Groups = list[list[Recording]]
 def read_capture(
     path: Any, *, exposure_s: Any, kind: Any, cfa: str | None, overscan: Any, progress: bool, roi: Any, **keywords: Any
 ) -> FrameStack:
-    """What `hsnoise.load` does; `keywords` are levels, shutter and row_axis."""
+    """The work of `hsnoise.load`; `keywords` are levels, shutter and row_axis."""
     read, root, told, source = _recordings(path, progress)
     read = read if exposure_s is None else _with_given(read, exposure_s)
     read, about_kinds = with_kinds(read, kind, root)
@@ -68,7 +69,7 @@ def read_capture(
 
 
 def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
-    """All recordings, the folder that holds them, what was passed over, and where their format keeps the exposure."""
+    """All recordings, the folder that holds them, what was skipped, and where their format keeps the exposure."""
     if isinstance(path, str | Path) and (Path(path) / _emva.DESCRIPTOR).is_file():
         return _emva.read(Path(path)), Path(path), [], _emva.DESCRIPTOR
     paths, passed = paths_of(path)
@@ -81,7 +82,7 @@ def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[
 
 
 def _with_given(read: list[Recording], exposure_s: Any) -> list[Recording]:
-    """Exposures as given; warns if a file says another."""
+    """Exposures as given; warns if a file states another."""
     given = np.full(len(read), exposure_s) if np.ndim(exposure_s) == 0 else exposure_s
     values = numbers("exposure_s", given, len(read), "file or exposure").tolist()
     _warn_of_other_exposures(read, values)
@@ -89,7 +90,7 @@ def _with_given(read: list[Recording], exposure_s: Any) -> list[Recording]:
 
 
 def _with_exposures_of_names(read: list[Recording], root: Path) -> tuple[list[Recording], list[str]]:
-    """Exposures that only the names of files and folders tell, and a sentence that says so."""
+    """Exposures taken from the names of files and folders where headers lack them, and a sentence that says so."""
     out = [
         recording
         if recording.exposure_s is not None
@@ -99,14 +100,16 @@ def _with_exposures_of_names(read: list[Recording], root: Path) -> tuple[list[Re
     named = [new for old, new in zip(read, out, strict=True) if old.exposure_s is None and new.exposure_s is not None]
     seconds = ", ".join(f"{t:g}" for t in sorted({recording.exposure_s for recording in named}))
     n = sum(recording.n_frames for recording in named)
-    return out, [f"{frames(n)}: exposure by the names of files and folders ({seconds} s)"] if named else []
+    return out, [f"{frames(n)}: exposure taken from the names of files and folders ({seconds} s)"] if named else []
 
 
 def _check_exposures(read: list[Recording], source: str) -> None:
     for recording in read:
         value = recording.exposure_s
         if value is None:
-            raise ValueError(f"{recording.path}: no exposure time (looked for {source}); give exposure_s=, in seconds")
+            raise ValueError(
+                f"{recording.path}: no exposure time (looked for {source}); give {setting('exposure_s')}, in seconds"
+            )
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{recording.path}: expected an exposure_s >= 0, got {value} s")
 
@@ -116,7 +119,8 @@ def _warn_of_other_exposures(read: list[Recording], given: list[float]) -> None:
         own = recording.exposure_s
         if own is not None and abs(value - own) > RELATIVE_TOLERANCE * own:
             warnings.warn(
-                f"exposure_s: {recording.path} says {own:g} s; the given {value:g} s are taken instead", stacklevel=4
+                f"{named('exposure_s')}: {recording.path} says {own:g} s; the given {value:g} s are used instead",
+                stacklevel=4,
             )
             return
 
@@ -125,13 +129,14 @@ def _warn_of_another_cfa(read: list[Recording], given: str) -> None:
     for recording in read:
         if recording.cfa not in (None, UNKNOWN_ORDER, given):
             warnings.warn(
-                f"cfa: {recording.path} says {recording.cfa}; the given {given} is taken instead", stacklevel=4
+                f"{named('cfa')}: {recording.path} says {recording.cfa}; the given {given} is used instead",
+                stacklevel=4,
             )
             return
 
 
 def _shared(read: list[Recording], name: str) -> Any:
-    """What all files say of `name`."""
+    """The one value of `name` in all files."""
     first, *others = read
     for other in others:
         one, two = getattr(first, name), getattr(other, name)
@@ -172,12 +177,12 @@ def _stack(
 
 
 def _known(read: list[Recording], name: str) -> Any:
-    """What the files say of `name` that say it; those that contradict the most have been set aside."""
+    """The value of `name` in the files that state it; files that contradict the majority have been set aside."""
     return next((value for value in (getattr(one, name) for one in read) if value is not None), None)
 
 
 def _stated_gain(read: list[Recording]) -> tuple[StatedGain | None, list[str]]:
-    """The gain that the headers state, and what to say if they contradict each other."""
+    """The gain that the headers state, and a sentence if they contradict each other."""
     stated = {one.stated_gain.source: one.stated_gain for one in read if one.stated_gain is not None}
     if len(stated) < 2:
         return next(iter(stated.values()), None), []
@@ -185,7 +190,7 @@ def _stated_gain(read: list[Recording]) -> tuple[StatedGain | None, list[str]]:
 
 
 def _black_dn(read: list[Recording]) -> float:
-    """Mean of one of the shortest darks, DN, if there are flats to compare; 0 without either."""
+    """Mean of one of the shortest darks, DN, if there are flats to compare; otherwise 0."""
     darks = [one for one in read if one.kind == "dark"]
     if len(darks) in (0, len(read)):
         return 0.0
@@ -195,12 +200,12 @@ def _black_dn(read: list[Recording]) -> float:
 def _cfa(read: list[Recording]) -> str:
     found = _known(read, "cfa") or "mono"
     if found == UNKNOWN_ORDER:
-        raise ValueError(f"{read[0].path}: a colour mosaic, but its Bayer order is not certain; give cfa=")
+        raise ValueError(f"{read[0].path}: a colour mosaic of unknown Bayer order; give {setting('cfa')}")
     return found
 
 
 def _black_level(read: list[Recording]) -> Any:
-    """Mean of what the files say; some cameras write a slightly different level in each frame."""
+    """Mean of the levels in the files; some cameras write a slightly different level in each frame."""
     levels = [recording.black_level for recording in read]
     if any(level is None for level in levels):
         return _shared(read, "black_level")
@@ -208,7 +213,7 @@ def _black_level(read: list[Recording]) -> Any:
     if np.ptp(levels_dn, axis=0).max() > 1:
         raise ValueError(
             f"files differ in black_level by more than 1 DN ({levels_dn.min():g} to {levels_dn.max():g}); "
-            "give black_level= or load them separately"
+            f"give {setting('black_level')} or load them separately"
         )
     return levels_dn.mean(axis=0)
 
@@ -216,7 +221,7 @@ def _black_level(read: list[Recording]) -> Any:
 def _region(counts: list[Any], cfa: str, roi: tuple[Any, Any], row_axis: int) -> tuple[list[Any], str]:
     """Counts and Bayer order of a region, all in stored orientation; `roi` is in sensor orientation."""
     if not isinstance(roi, Sequence) or len(roi) != 2:
-        raise ValueError(f"roi: expected ((first row, end row), (first column, end column)), got {roi!r}")
+        raise ValueError(f"{named('roi')}: expected ((first row, end row), (first column, end column)), got {roi!r}")
     sizes = counts[0].shape[1:]
     spans = roi[::-1] if row_axis == 1 else roi
     rows, columns = (span("roi", one, size) for one, size in zip(spans, sizes, strict=True))

@@ -1,4 +1,4 @@
-"""Folders with a descriptor of the EMVA 1288 standard, EMVA1288_Data.txt, which says what each image is."""
+"""Folders with EMVA1288_Data.txt, the descriptor of the EMVA 1288 standard that lists the images."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ KINDS = {"b": "flat", "d": "dark"}  # bright, dark
 
 
 def read(folder: Path) -> list[Recording]:
-    """The images that the descriptor names, with kind and exposure; white is the largest code of its bits.
+    """The images that the descriptor lists, with kind and exposure; white is the largest code of its bit depth.
 
-    Its lines: `n bits rows columns`; `b exposure_ns photons` or `d exposure_ns`; below it `i image` for each.
+    Its rows are `n bits rows columns`, then `b exposure_ns photons` or `d exposure_ns`, followed by `i image` for each.
 
     Raises:
-        ValueError: a line that does not follow this, or an image that cannot be read.
+        ValueError: a row of another form, or an image that cannot be read.
     """
     path = folder / DESCRIPTOR
     with naming(path):

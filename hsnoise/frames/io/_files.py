@@ -1,4 +1,4 @@
-"""Which files a path names, and their reader."""
+"""The files that a path names, and their reader."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from hsnoise._core.naming import named
 from hsnoise.frames.io._kinds import folder_of
 from hsnoise.frames.lazy import in_order
 
@@ -26,7 +27,7 @@ PASSED_OVER = ("bad", "rejected", "reduced", "calibrated", "processed", "stacked
 
 
 def root_of(path: Any, paths: list[Path]) -> Path:
-    """The folder that a capture lies in: `path` itself, or the one that holds all its files."""
+    """The folder of a capture: `path` itself, or the one that holds all its files."""
     if isinstance(path, str | Path) and Path(path).is_dir():
         return Path(path)
     parents = {one.absolute().parent for one in paths}
@@ -35,16 +36,18 @@ def root_of(path: Any, paths: list[Path]) -> Path:
 
 
 def paths_of(path: Any) -> tuple[list[Path], list[str]]:
-    """The files meant, of known formats in folders and those below, of any named in a list; and what was passed over.
+    """The files that `path` names, and what was skipped. Folders give all files of known formats in and below them.
 
     Raises:
-        FileNotFoundError: there is none, or one of them is missing. TypeError: a path is none.
+        FileNotFoundError: there are none, or one is missing. TypeError: `path` is not a path.
     """
     paths: list[Path] = []
     told: list[str] = []
     if not isinstance(path, str | Path):
         if not isinstance(path, Iterable):
-            raise TypeError(f"path: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}")
+            raise TypeError(
+                f"{named('path')}: expected a folder, a file, a pattern or a list of files, got {type(path).__name__}"
+            )
         for one in map(Path, path):
             inside, passed = _below(one) if one.is_dir() else ([one], [])
             paths += inside
@@ -56,20 +59,20 @@ def paths_of(path: Any) -> tuple[list[Path], list[str]]:
     else:
         paths = [Path(path)]
     if not paths:
-        raise FileNotFoundError(f"path: no capture in {path!s}; known formats: {' '.join(READERS.values())}")
+        raise FileNotFoundError(f"{named('path')}: no capture in {path!s}; known formats: {' '.join(READERS.values())}")
     for one in paths:
         if not one.is_file():
-            raise FileNotFoundError(f"path: no such file or folder: {one}")
+            raise FileNotFoundError(f"{named('path')}: no such file or folder: {one}")
     return paths, told
 
 
 def _below(root: Path) -> tuple[list[Path], list[str]]:
-    """Files of known formats in a folder and the folders in it, in natural order, but for those of `PASSED_OVER`."""
+    """Files of known formats in and below a folder, in natural order, without folders named in `PASSED_OVER`."""
     found: list[Path] = []
     told = []
     seen: set[str] = set()
     for folder, inside, names in os.walk(root, followlinks=True):
-        if os.path.realpath(folder) in seen:  # a link that leads back
+        if os.path.realpath(folder) in seen:  # a link that loops back
             inside[:] = []
             continue
         seen.add(os.path.realpath(folder))
@@ -82,7 +85,7 @@ def _below(root: Path) -> tuple[list[Path], list[str]]:
 
 
 def reader_name(path: Path) -> str | None:
-    """The module that reads files of this name, None if none does."""
+    """The module that reads files of this name, or None."""
     for name, suffixes in READERS.items():
         if path.name.lower().endswith(tuple(suffixes.split())):
             return name
@@ -90,10 +93,10 @@ def reader_name(path: Path) -> str | None:
 
 
 def of_one_format(paths: list[Path], root: Path) -> tuple[list[Path], ModuleType, list[str]]:
-    """The files of the format that most have, their reader, and what was set aside.
+    """The files of the most common format, their reader, and what was set aside.
 
     Raises:
-        ValueError: an unknown format, or two that as many files have.
+        ValueError: an unknown format, or two formats with equally many files.
     """
     names = [reader_name(path) for path in paths]
     if None in names:
@@ -102,7 +105,7 @@ def of_one_format(paths: list[Path], root: Path) -> tuple[list[Path], ModuleType
     if others and others[0][1] == n:
         first = [next(path.name for path, name in zip(paths, names, strict=True) if name == one) for one in names]
         one, two = list(dict.fromkeys(first))[:2]
-        raise ValueError(f"path: files of several formats ({one}, {two}); give a pattern such as '*.dng'")
+        raise ValueError(f"{named('path')}: files of several formats ({one}, {two}); give a pattern such as '*.dng'")
     reader = import_module(f"hsnoise.frames.io.{most}")
     chosen = [path for path, name in zip(paths, names, strict=True) if name == most]
     rest = [path for path, name in zip(paths, names, strict=True) if name != most]

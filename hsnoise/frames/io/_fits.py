@@ -1,4 +1,4 @@
-"""FITS files, by Astropy."""
+"""FITS files, read by Astropy."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ EXPOSURE_FROM = "EXPTIME, EXPOSURE or EXP_TIME in the FITS header"
 def read(path: Path) -> list[Recording]:
     """The image of a FITS file: one frame, or frames of one exposure along the slowest axis of three.
 
-    Exposure, kind, temperature, binning, gain, filter and Bayer order are taken from the image's header, or else from
-    the primary one; see `_header`.
+    Exposure, kind, temperature, binning, gain, filter and Bayer order come from the image's header or, failing that,
+    from the primary header; see `_header`.
 
     Raises:
         ValueError: unreadable, truncated, or not exactly one image of raw frames.
@@ -52,14 +52,14 @@ def _image_index(file: fits.HDUList) -> int:
 
 def _check_complete(path: Path, hdu: Any) -> None:
     if isinstance(hdu, fits.CompImageHDU) or path.suffix.lower() == ".gz":
-        return  # a decompressor notices itself
+        return  # the decompressor notices by itself
     end, size = hdu.fileinfo()["datLoc"] + hdu.size, path.stat().st_size
     if end > size:
         raise ValueError(f"truncated: {size} bytes, its header promises {end}")
 
 
 def _dtype(header: fits.Header) -> np.dtype:
-    """Of the counts: BZERO makes signed integers unsigned, any other scale makes them floating."""
+    """The counts' dtype: BZERO makes signed integers unsigned; any other scaling makes them floats."""
     bits, zero = header["BITPIX"], header.get("BZERO", 0)
     if bits < 0 or header.get("BSCALE", 1) != 1:
         return np.dtype(np.float64 if bits == -64 else np.float32)

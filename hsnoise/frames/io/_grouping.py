@@ -1,4 +1,4 @@
-"""Recordings to exposure groups."""
+"""Sorting recordings into exposure groups."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from hsnoise.frames.io._recording import Recording
 from hsnoise.frames.lazy import LazyFrames
 
-RELATIVE_TOLERANCE = 1e-3  # EXIF rounds, and cameras time an exposure to about a line
+RELATIVE_TOLERANCE = 1e-3  # EXIF rounds, and cameras time exposures to about one row
 
 
 def group_by_exposure(recordings: Sequence[Recording]) -> list[list[Recording]]:
-    """Recordings of one kind and exposure time together: darks before flats, short before long.
+    """Recordings grouped by kind and exposure time: darks before flats, short before long.
 
-    Recordings whose exposure is within 1e-3 (relative) of the shortest of a group belong to that group; in a
-    group they keep the order they came in.
+    A recording whose exposure is within 1e-3 (relative) of the shortest in a group joins that group. Groups keep the
+    order of their recordings.
     """
     groups: list[list[int]] = []
     order = sorted(range(len(recordings)), key=lambda i: (recordings[i].kind, recordings[i].exposure_s, i))
@@ -46,7 +46,7 @@ def group_temperature_c(group: Sequence[Recording]) -> float:
 
 
 def group_counts(group: Sequence[Recording]) -> Any:
-    """All frames of a group, `[frame, row, column]`; lazy if there is more than one file, or if their time is known."""
+    """All frames of a group, `[frame, row, column]`; lazy for several files, or if times are known."""
     if len(group) == 1 and group[0].taken is None:
         return group[0].counts
     readers, names, taken = [], [], []

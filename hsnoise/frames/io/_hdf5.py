@@ -1,4 +1,4 @@
-"""HDF5 files, by h5py."""
+"""HDF5 files, read by h5py."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read(path: Path) -> list[Recording]:
     it, attributes of it or attributes of the file.
 
     Raises:
-        ValueError: unreadable, truncated, or without counts of such a shape.
+        ValueError: unreadable, truncated, or without counts of these shapes.
     """
     with naming(path), h5py.File(path, "r") as file:
         if "counts" not in file:

@@ -1,4 +1,4 @@
-"""What a FITS header says of its frames, in the words that cameras and capture programs use."""
+"""Fields of FITS headers, under the names that cameras and capture programs use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNITS_S = {  # in comments of exposures
     r"\b([uµ]s|usecs?|micro-?sec\w*)\b": 1e-6,
     r"\bminutes?\b": 60.0,
 }
-LEAST_E, MOST_E = 0.1, 10.0  # electrons per DN that a number without a unit may be
+LEAST_E, MOST_E = 0.1, 10.0  # range in which a number without a unit may be electrons per DN
 ELECTRONS_PER_DN = re.compile(r"\be(lectrons?)?-?\s*(/|per)\s*(adu|dn|count)", re.IGNORECASE)
 
 
@@ -49,7 +49,7 @@ def described(header: fits.Header, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def _exposure_s(header: fits.Header) -> float | None:
-    """The exposure in seconds, or in the unit that its comment names."""
+    """The exposure in s, converted if its comment names another unit."""
     for name in EXPOSURE:
         value = _number(header, (name,))
         if value is not None:
@@ -62,7 +62,7 @@ def stated_gain(header: fits.Header) -> StatedGain | None:
     """EGAIN, or a GAIN that may be electrons per DN rather than the number of a setting."""
     electrons = _number(header, ("EGAIN",))
     if electrons is not None and electrons > 0:
-        # Drivers that do not know it write 1.
+        # Drivers that do not know the gain write 1.
         return StatedGain(1 / electrons, f"EGAIN {electrons:.4g} e-/DN", certain=electrons != 1)
     for name in GAIN:
         value = _number(header, (name,))
@@ -105,7 +105,7 @@ def _binning(header: fits.Header) -> tuple[int, int] | None:
 
 
 def _section(text: str | None, size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """[first column:last column, first row:last row], counted from 1, as spans; None if it is outside the frame."""
+    """[first column:last column, first row:last row], counted from 1, as spans; None if outside the frame."""
     numbers = [int(n) for n in re.findall(r"\d+", text or "")]
     if len(numbers) != 4:
         return None
@@ -115,7 +115,7 @@ def _section(text: str | None, size: tuple[int, int]) -> tuple[tuple[int, int], 
 
 
 def _cfa(header: fits.Header) -> str | None:
-    """Bayer order from the first stored pixel on; for ROWORDER BOTTOM-UP programs disagree what it means."""
+    """Bayer order from the first stored pixel on; programs disagree on what it means with ROWORDER BOTTOM-UP."""
     pattern = str(header.get("BAYERPAT", "")).strip().upper()
     if not pattern:
         return None

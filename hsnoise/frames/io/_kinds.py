@@ -1,4 +1,4 @@
-"""Which frames are darks and which flats: by header, then by the names of file and folder."""
+"""Sorting frames into darks and flats: by header, then by the names of file and folder."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.arguments import KINDS
 from hsnoise.frames.io._recording import Recording
 
-# In this order, so that a "dark flat" is a dark.
+# The order matters: a "dark flat" is a dark.
 CALIBRATION = {"dark": ("dark",), "bias": ("bias", "zero", "offset"), "flat": ("flat",)}
 LIT = ("linearity", "sensitivity", "ptc", "twilight")  # series of lit frames that measure a sensor
 LIGHTS = ("light", "lights", "science", "sci", "object", "objects")
@@ -20,7 +21,7 @@ EXPOSURE = re.compile(r"(?<![\d.])(\d+(?:\.\d+)?)[ _-]?(secs?|s|ms|us)(?![a-z])"
 
 
 def kind_of(text: str | None, calibration_only: bool = False) -> str | None:
-    """dark, bias, flat or light, told by a word in `text`; None: no such word."""
+    """dark, bias, flat or light, by a word in `text`; None: no such word."""
     words = re.findall("[a-z]+", (text or "").lower())
     for kind, signs in CALIBRATION.items():
         if any(sign in word for word in words for sign in signs):
@@ -31,9 +32,9 @@ def kind_of(text: str | None, calibration_only: bool = False) -> str | None:
 
 
 def names_of(path: Path, root: Path) -> list[str]:
-    """Names that may tell what a file is: its own first, then its folders' up to `root`.
+    """Names that may reveal a file's kind: its own first, then its folders' up to `root`.
 
-    That of `root` itself counts only if it begins with a word for a kind: users name it otherwise after anything.
+    The name of `root` counts only if it begins with a word for a kind, because users name it after anything.
     """
     folders = list(path.parent.relative_to(root).parts[::-1]) if path.is_relative_to(root) else []
     first_word = re.match("[a-z]*", root.name.lower())
@@ -42,7 +43,7 @@ def names_of(path: Path, root: Path) -> list[str]:
 
 
 def with_kinds(read: Sequence[Recording], given: Any, root: Path) -> tuple[list[Recording], list[str]]:
-    """Recordings that are "dark", "flat" or "light", and what was assumed to say so.
+    """Recordings with kind "dark", "flat" or "light", and sentences on what was assumed.
 
     A bias frame is a dark, of 0 s if the file states no exposure.
 
@@ -51,11 +52,11 @@ def with_kinds(read: Sequence[Recording], given: Any, root: Path) -> tuple[list[
     """
     kinds = [given] * len(read) if given is None or isinstance(given, str) else list(given)
     if len(kinds) != len(read):
-        raise ValueError(f"kind: expected one, or {len(read)} (one a file or exposure), got {given}")
+        raise ValueError(f"{named('kind')}: expected one, or {len(read)} (one a file or exposure), got {given}")
     out, reasons = [], []
     for recording, kind in zip(read, kinds, strict=True):
         if kind is not None and kind not in KINDS:
-            raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {kind!r}; give kind=")
+            raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {kind!r}; give {setting('kind')}")
         found, reason = (kind, None) if kind is not None else _told(recording, root)
         exposure_s = 0.0 if found == "bias" and recording.exposure_s is None else recording.exposure_s
         out.append(replace(recording, kind="dark" if found == "bias" else found, exposure_s=exposure_s))
@@ -64,11 +65,13 @@ def with_kinds(read: Sequence[Recording], given: Any, root: Path) -> tuple[list[
 
 
 def _told(recording: Recording, root: Path) -> tuple[str, str | None]:
-    """Kind of a file, and in words why, where its header does not say."""
+    """Kind of a file, and the reason in words if its header does not state it."""
     if recording.kind in CALIBRATION:
         return recording.kind, None
     if recording.kind not in (None, "light"):
-        raise ValueError(f"{recording.path}: expected kind 'dark' or 'flat', got {recording.kind!r}; give kind=")
+        raise ValueError(
+            f"{recording.path}: expected kind 'dark' or 'flat', got {recording.kind!r}; give {setting('kind')}"
+        )
     names = names_of(recording.path, root)
     is_light = any(kind_of(name) == "light" for name in names)
     if is_light and recording.kind == "light":
@@ -101,13 +104,13 @@ def frames(n: int) -> str:
 
 
 def folder_of(path: Path, root: Path) -> str:
-    """ " in bias/", or nothing for files of `root` itself."""
+    """ " in bias/", or empty for files in `root` itself."""
     inside = path.is_relative_to(root) and path.parent != root
     return f" in {path.parent.relative_to(root)}/" if inside else ""
 
 
 def exposure_of_names(path: Path, root: Path) -> float | None:
-    """Seconds that the name of a file or of its folders states ("dark_0.05s", "30 s"), None if none does."""
+    """Seconds in the name of a file or of its folders ("dark_0.05s", "30 s"); None if there are none."""
     for name in names_of(path, root):
         found = EXPOSURE.search(name)
         if found is not None:

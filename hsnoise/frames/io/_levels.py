@@ -1,4 +1,4 @@
-"""Flats of one exposure but of different light: levels of their own."""
+"""Splitting flats of one exposure but different light into separate levels."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 from hsnoise.frames.io._recording import Recording
 
-SAME_LIGHT = 0.05  # of the signal: frames further apart are of another light
-STEADY_DN = 5.0  # differences that a wandering black level may make
-THIN = 5  # odd, so that all colours of a mosaic are met; every such row and column is enough for a mean
-SATURATED = 0.5  # share of pixels at white from which on a frame tells nothing
-READERS = 2  # files that are decoded at a time
+SAME_LIGHT = 0.05  # of the signal: frames that differ by more are different levels
+STEADY_DN = 5.0  # differences that a drifting black level may cause
+THIN = 5  # one in so many rows and columns is enough for a mean; odd, to meet all colours of a mosaic
+SATURATED = 0.5  # share of pixels at white; from here on a frame is useless
+READERS = 2  # files decoded at the same time
 
 Groups = list[list[Recording]]
 
 
 def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> tuple[Groups, list[str]]:
-    """Groups of flats split by filter and light, darker first, and what was found; groups of darks as they are.
+    """Groups of flats split by filter and light, darker first, and what was found; groups of darks are unchanged.
 
-    A thinned mean of the first frame of each file is compared. Flats that are mostly at `white_level` are left out.
+    The thinned means of each file's first frame are compared. Flats with most pixels at `white_level` are left out.
     """
     out: Groups = []
     told: list[str] = []
@@ -48,11 +48,11 @@ def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> 
 
 
 def thinned(group: Sequence[Recording], white_level: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Of the first frame of each recording: mean, DN, and whether most pixels are saturated."""
+    """Mean, DN, of each recording's first frame, and whether most of its pixels are saturated."""
 
     def of(recording: Recording) -> tuple[float, bool]:
         some = np.asarray(recording.counts[0])[::THIN, ::THIN]
-        # A frame of one count throughout is at white, whether the file says where that is or not.
+        # A frame with the same count everywhere is at white, even if the file states no white level.
         white = some.max() if some.min() == some.max() else np.inf if white_level is None else white_level
         return float(some.mean()), bool(np.mean(some >= white) > SATURATED)
 
@@ -62,7 +62,7 @@ def thinned(group: Sequence[Recording], white_level: float | None = None) -> tup
 
 
 def _levels_of(group: Sequence[Recording], signal_dn: np.ndarray) -> Groups:
-    """By filter and light, and by folder, too, where each folder holds several frames of its level."""
+    """Split by filter and light, and also by folder where each folder holds several frames of its level."""
     by_folder = _split(group, signal_dn, lambda r: (r.filter_name or "", str(r.path.parent)))
     if all(sum(r.n_frames for r in level) > 1 for level in by_folder):
         return by_folder

@@ -1,4 +1,4 @@
-"""NumPy files: .npy memory-mapped, .npz loaded whole."""
+"""NumPy files: .npy is memory-mapped, .npz loaded whole."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ EXPOSURE_FROM = "'exposure_s' in an .npz file"
 def read(path: Path) -> list[Recording]:
     """Counts `[row, column]`, `[frame, row, column]` or `[exposure, frame, row, column]` of a NumPy file.
 
-    An .npy file is memory-mapped. An .npz file is compressed, so it is loaded whole; it holds `counts`, and
-    may hold exposure_s, kind, black_level, white_level, cfa, shutter, iso and temperature_c. An .npz file of several
-    arrays `[frame, row, column]` is read with the .json file beside it, in which `arrays` gives each its `kind` and
-    `exposure_s`.
+    An .npy file is memory-mapped. An .npz file is compressed, so it is loaded whole. It holds `counts`, and may hold
+    exposure_s, kind, black_level, white_level, cfa, shutter, iso and temperature_c. An .npz file of several arrays
+    `[frame, row, column]` needs a .json file beside it, whose `arrays` gives the `kind` and `exposure_s` of each.
 
     Raises:
-        ValueError: unreadable, truncated, or without counts of such a shape.
+        ValueError: unreadable, truncated, or without counts of these shapes.
     """
     with naming(path):
         if path.suffix.lower() == ".npy":
             return recordings(path, _groups(np.load(path, mmap_mode="r")), {})
         if not zipfile.is_zipfile(path):
-            raise ValueError("it is no .npz file, or one that was cut off")
+            raise ValueError("it is not an .npz file, or it is truncated")
         with path.open("rb") as file, np.load(file) as arrays:
             if "counts" not in arrays and path.with_suffix(".json").is_file():
                 return _described(path, arrays)
@@ -40,7 +39,7 @@ def read(path: Path) -> list[Recording]:
 
 
 def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
-    """Recordings of named arrays, by what the .json file beside them says of each."""
+    """Recordings of named arrays, described by the .json file beside them."""
     about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     found = []
     for name, one in about["arrays"].items():

@@ -1,4 +1,4 @@
-"""Overscan: columns or rows at the edge of a frame that are read without light, or have none."""
+"""Overscan: columns or rows at the edge of a frame that see no light, or are read without pixels."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.arguments import span
+from hsnoise._core.naming import named, setting
 from hsnoise.frames.io._recording import Recording
 from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 
 LEAST, MOST = 3, 128  # columns of an overscan
-WIDEST = 0.25  # of the frame: more is no edge
+WIDEST = 0.25  # of the frame: a wider strip is not an edge
 UNLIT, LIT = 0.3, 0.7  # of the median signal
-BLURRED = 3  # columns at most in between: vignetting falls over more
+BLURRED = 3  # columns at most between unlit and lit: vignetting is more gradual
 LEAST_SIGNAL_DN = 10.0
-SOME_FRAMES = 3  # of a group, which tell the mean of its overscan
+SOME_FRAMES = 3  # of a group, from which the mean of its overscan is taken
 
 Overscan = str | tuple[Any, Any] | None
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows (axis 0) or columns (axis 1) from `start` to `stop` (excluded) at an edge of a frame of `size` of them."""
+    """Rows (axis 0) or columns (axis 1) from `start` to `stop` (excluded) at an edge of a frame with `size` of them."""
 
     axis: int
     start: int
@@ -38,24 +39,24 @@ class Strip:
 
     @property
     def rest(self) -> tuple[int, int]:
-        """What is left of the axis."""
+        """The rest of the axis."""
         return (self.stop, self.size) if self.start == 0 else (0, self.start)
 
     def pixels(self, frame: np.ndarray) -> np.ndarray:
-        """Pixels of the outer half of the strip in a frame [row, column]: beside the light charge is left behind."""
+        """Pixels of the outer half of the strip in a frame [row, column]; the inner half holds charge left behind."""
         margin = (self.stop - self.start) // 2
         start, stop = (self.start, self.stop - margin) if self.start == 0 else (self.start + margin, self.stop)
         return frame[start:stop] if self.axis == 0 else frame[:, start:stop]
 
 
 def with_overscan(stack: FrameStack, overscan: Overscan, read: Sequence[Recording] = ()) -> FrameStack:
-    """The stack without its overscan, whose means are kept in `overscan_dn`; for None whole, but named.
+    """The stack without its overscan, whose means are kept in `overscan_dn`; None keeps it and only names it.
 
     Args:
         stack: frames.
-        overscan: "auto": what is found; ((first row, end row), (first column, end column)) of the overscan, None for
-            all rows or all columns; None: name what is found.
-        read: whence the frames come, whose headers may name the overscan.
+        overscan: "auto": find it; ((first row, end row), (first column, end column)) of the overscan, None for
+            all rows or all columns; None: only name what is found.
+        read: the frames' recordings, whose headers may name the overscan.
 
     Raises:
         ValueError: `overscan` is none of these, or not at an edge.
@@ -63,11 +64,11 @@ def with_overscan(stack: FrameStack, overscan: Overscan, read: Sequence[Recordin
     if overscan is not None and not isinstance(overscan, str):
         return _without(stack, [_given(overscan, stack.shape)])
     if overscan not in (None, "auto"):
-        raise ValueError(f"overscan: expected 'auto', None or spans of rows and columns, got {overscan!r}")
+        raise ValueError(f"{named('overscan')}: expected 'auto', None or spans of rows and columns, got {overscan!r}")
     strips = find(stack) or stated(stack, read)
     if overscan == "auto" and strips:
         return _without(stack, strips)
-    told = [f"{str(one).capitalize()} look like overscan: overscan='auto' takes them off" for one in strips]
+    told = [f"{str(one).capitalize()} look like overscan: {setting('overscan', 'auto')} removes them" for one in strips]
     return replaced(stack, assumed=(*stack.assumed, *told)) if told else stack
 
 
@@ -97,7 +98,7 @@ def find(stack: FrameStack) -> list[Strip]:
 
 
 def _dark_end(profile: np.ndarray) -> int:
-    """How many values at the start are dark, if the step to those that are lit is sharp; 0: none."""
+    """The number of dark values at the start, if the step to lit values is sharp; otherwise 0."""
     unlit, lit = np.abs(profile) < UNLIT, profile > LIT
     if unlit.all() or not lit.any():
         return 0
@@ -107,7 +108,7 @@ def _dark_end(profile: np.ndarray) -> int:
 
 
 def stated(stack: FrameStack, read: Sequence[Recording]) -> list[Strip]:
-    """The overscan of the headers, if all name the same; without flats nothing tests it."""
+    """The overscan in the headers, if all agree. Without flats it cannot be verified."""
     sections = {recording.overscan for recording in read}
     if len(sections) != 1 or None in sections or "flat" in stack.kind:
         return []
@@ -119,7 +120,7 @@ def stated(stack: FrameStack, read: Sequence[Recording]) -> list[Strip]:
 
 
 def levels_dn(stack: FrameStack, strips: Sequence[Strip]) -> np.ndarray:
-    """Mean of the overscan of each group [exposure], DN, in up to SOME_FRAMES of its frames."""
+    """Mean overscan of each group [exposure], DN, over up to SOME_FRAMES of its frames."""
     means = []
     for i, n in enumerate(stack.n_frames):
         frames = [stack.frame(i, j) for j in sorted({k * (n - 1) // (SOME_FRAMES - 1) for k in range(SOME_FRAMES)})]
@@ -128,9 +129,11 @@ def levels_dn(stack: FrameStack, strips: Sequence[Strip]) -> np.ndarray:
 
 
 def _given(overscan: Any, shape: tuple[int, int]) -> Strip:
-    """Spans of rows and columns as a strip. Raises ValueError unless it is one, at an edge."""
+    """Spans of rows and columns as a strip. Raises ValueError unless they form a strip at an edge."""
     if not isinstance(overscan, Sequence) or len(overscan) != 2:
-        raise ValueError(f"overscan: expected ((first row, end row), (first column, end column)), got {overscan!r}")
+        raise ValueError(
+            f"{named('overscan')}: expected ((first row, end row), (first column, end column)), got {overscan!r}"
+        )
     spans = [span("overscan", one, size) for one, size in zip(overscan, shape, strict=True)]
     narrow = [axis for axis, one in enumerate(spans) if one.stop - one.start < shape[axis]]
     if len(narrow) == 1:
@@ -139,13 +142,13 @@ def _given(overscan: Any, shape: tuple[int, int]) -> Strip:
         if strip.start == 0 or strip.stop == strip.size:
             return strip
     raise ValueError(
-        f"overscan: expected columns at an edge of all rows, or rows at an edge of all columns, got {overscan!r} for"
-        f" frames of {shape[0]} x {shape[1]}"
+        f"{named('overscan')}: expected columns at an edge of all rows, or rows at an edge of all columns, got"
+        f" {overscan!r} for frames of {shape[0]} x {shape[1]}"
     )
 
 
 def without(shape: tuple[int, int], strips: Sequence[Strip]) -> list[tuple[int, int]]:
-    """Spans of rows and of columns that are left without strips."""
+    """Spans of rows and columns that remain without the strips."""
     rest = [(0, size) for size in shape]
     for one in strips:
         rest[one.axis] = max(rest[one.axis][0], one.rest[0]), min(rest[one.axis][1], one.rest[1])
@@ -154,6 +157,6 @@ def without(shape: tuple[int, int], strips: Sequence[Strip]) -> list[tuple[int, 
 
 def _without(stack: FrameStack, strips: Sequence[Strip]) -> FrameStack:
     rows, columns = without(stack.shape, strips)
-    told = [f"{str(one).capitalize()} were taken off as overscan" for one in strips]
+    told = [f"{str(one).capitalize()} were removed as overscan" for one in strips]
     part = stack.select(rows=rows, columns=columns)
     return replaced(part, overscan_dn=levels_dn(stack, strips), assumed=(*part.assumed, *told))

@@ -1,4 +1,4 @@
-"""Greyscale PNG files, by Pillow."""
+"""Greyscale PNG files, read by Pillow."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from PIL import Image
 
 from hsnoise.frames.io._recording import Recording, lazy_frames, naming
 
-EXPOSURE_FROM = "PNG files, which hold none"
+EXPOSURE_FROM = "the PNG format, which has none"
 _DTYPES = {"I;16": np.uint16, "L": np.uint8}
-_DEPTH_AT = 24  # byte of the file that holds the bits of a sample
+_DEPTH_AT = 24  # byte of the file that holds the bits per sample
 
 
 def read(path: Path) -> list[Recording]:
-    """One frame of a greyscale PNG of 16 bits (or 8); the format tells nothing about the exposure.
+    """One frame of a greyscale PNG of 16 bits (or 8); the format does not hold the exposure.
 
     Raises:
         ValueError: unreadable, or a colour image.

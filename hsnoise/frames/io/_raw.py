@@ -1,4 +1,4 @@
-"""Camera raw files and DNG, by LibRaw (rawpy); exposure and ISO from EXIF."""
+"""Camera raw files and DNG, read by LibRaw (rawpy); exposure and ISO come from EXIF."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXPOSURE_FROM = "EXIF ExposureTime"
 
 
 def read(path: Path) -> list[Recording]:
-    """The raw Bayer counts of a camera file, visible area; pixels are read later.
+    """The raw Bayer counts in the visible area of a camera file; pixels are read later.
 
     Black level is LibRaw's per channel (the two greens averaged), white level LibRaw's saturation value.
 
@@ -62,7 +62,7 @@ def _exif(path: Path) -> dict[str, Any]:
 
 
 def _first(exif: dict[str, Any], tag: str, libraw: float) -> float | None:
-    """An EXIF value, or LibRaw's (float32; 0: unknown) where exifread does not know the container."""
+    """An EXIF value, or LibRaw's (float32; 0: unknown) if exifread does not know the container."""
     for key in (f"EXIF {tag}", f"Image {tag}"):
         if key in exif and exif[key].values:
             return float(exif[key].values[0])

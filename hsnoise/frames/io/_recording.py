@@ -1,4 +1,4 @@
-"""What every reader returns, and the words it uses: `Recording`."""
+"""`Recording`, which every reader returns."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.types import StatedGain
 from hsnoise.frames.lazy import LazyFrames
 
-UNKNOWN_ORDER = "unknown order"  # a colour mosaic whose Bayer order the file does not tell for sure
+UNKNOWN_ORDER = "unknown order"  # a colour mosaic whose Bayer order the file leaves open
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """Frames of one exposure in one file; what the file does not say is None.
+    """Frames of one exposure in one file; fields that the file does not state are None.
 
     Args:
         path: the file.
         counts: DN, `[frame, row, column]`, lazy unless the format forbids it.
-        exposure_s, iso, temperature_c: as `FrameStack` has them.
-        kind: "dark", "flat", "bias" (a dark of 0 s unless the file says another exposure) or "light".
+        exposure_s, iso, temperature_c: as in `FrameStack`.
+        kind: "dark", "flat", "bias" (a dark of 0 s unless the file states another exposure) or "light".
         cfa: "mono", a Bayer order or `UNKNOWN_ORDER`.
-        black_level, white_level: DN; black one value or one a channel.
+        black_level, white_level: DN; black is one value or one per channel.
         shutter: "rolling" or "global".
-        is_open: whether light was let in, by the file.
-        binning: sensor pixels in one of the file's, (rows, columns).
-        gain_setting: the number that the camera calls its gain, whatever its unit.
+        is_open: whether the shutter was open, according to the file.
+        binning: sensor pixels per pixel of the file, (rows, columns).
+        gain_setting: the number that the camera calls its gain, in any unit.
         stated_gain: the gain as electrons per DN, if the file states it.
         filter_name: the colour filter in front of the sensor.
-        is_master: an average of several frames, or counts that are no integers.
-        overscan: header's section of overscan pixels, ((first row, end row), (first column, end column)).
+        is_master: whether it is an average of several frames, or has counts that are not integers.
+        overscan: the header's section of overscan pixels, ((first row, end row), (first column, end column)).
         taken: time of the exposure, ISO 8601.
     """
 
@@ -70,7 +71,7 @@ class Recording:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Turn whatever a format's library raises on a broken file into a ValueError that names the file."""
+    """Turn any error that a format's library raises on a broken file into a ValueError that names the file."""
     try:
         yield
     except Exception as error:
@@ -90,7 +91,7 @@ def _read_named(path: Path, read: Any, index: int) -> np.ndarray:
 
 
 def _in_seconds(value: Any) -> np.ndarray:
-    """Time spans of any unit as seconds; all else as it is."""
+    """Time spans in any unit as seconds; anything else unchanged."""
     array = np.asarray(value)
     return array / np.timedelta64(1, "s") if array.dtype.kind == "m" else array
 
@@ -101,17 +102,17 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
     Args:
         path: the file.
         groups: counts `[frame, row, column]` of each exposure.
-        metadata: any of exposure_s, kind, temperature_c (one for all or one a group), cfa, shutter, iso,
+        metadata: any of exposure_s, kind, temperature_c (one for all or one per group), cfa, shutter, iso,
             black_level, white_level.
 
     Raises:
-        ValueError: a value is neither one for all nor one a group.
+        ValueError: a field has neither one value nor one per group.
     """
     per_group = {}
     for name in ("exposure_s", "kind", "temperature_c"):
         values = np.atleast_1d(_in_seconds(metadata[name])).tolist() if name in metadata else [None] * len(groups)
         if len(values) != len(groups) and (len(values) > 1 or name == "exposure_s"):
-            raise ValueError(f"{name}: expected {len(groups)} values (one an exposure), got {len(values)}")
+            raise ValueError(f"{named(name)}: expected {len(groups)} values (one an exposure), got {len(values)}")
         per_group[name] = values * len(groups) if len(values) < len(groups) else values
     shared = {
         name: np.asarray(metadata[name]).tolist()

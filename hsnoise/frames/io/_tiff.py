@@ -1,4 +1,4 @@
-"""TIFF files with one raw frame a page, by tifffile."""
+"""TIFF files with one raw frame per page, read by tifffile."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _CFA_PHOTOMETRIC = 32803
 
 
 def read(path: Path) -> list[Recording]:
-    """The pages of a TIFF file as frames, those of one exposure and ISO together; Bayer order from the first page.
+    """The pages of a TIFF file as frames, grouped by exposure and ISO; the Bayer order is the first page's.
 
     Raises:
-        ValueError: unreadable, truncated, colour pages, pages of several sizes, an exposure or ISO that is none.
+        ValueError: unreadable, truncated, colour pages, pages of several sizes, an invalid exposure or ISO.
     """
     with naming(path), tifffile.TiffFile(path) as file:
         pages = [page for page in file.pages if not page.is_reduced]  # reduced: a thumbnail
@@ -35,7 +35,7 @@ def read(path: Path) -> list[Recording]:
         first = _tags(pages[0])
         groups: dict[tuple[float | None, float | None], list[int]] = {}
         for page in pages:
-            tags = first | _tags(page)  # what a page does not say is as on the first
+            tags = first | _tags(page)  # a page inherits the first page's tags
             groups.setdefault((_exposure_s(tags), _iso(tags)), []).append(page.offset)
         return [
             Recording(
@@ -54,26 +54,26 @@ def _frames(path: Path, places: list[int], page: Any) -> LazyFrames:
 
 
 def _read_frame(path: Path, index: int, *, places: tuple[int, ...]) -> np.ndarray:
-    """The page whose directory lies at `places[index]`: to walk through all before it would take quadratic time."""
+    """The page whose directory is at `places[index]`: walking through the pages before it would take quadratic time."""
     with tifffile.TiffFile(path) as file:
         file.filehandle.seek(places[index])
         return tifffile.TiffPage(file, index).asarray()
 
 
 def _next_page(file: tifffile.TiffFile) -> int:
-    """Where a page that tifffile passed over for lying outside the file should begin; 0: none such."""
+    """Offset of a page that tifffile skipped because it is outside the file; 0: there is none."""
     file.filehandle.seek(file.pages.next_page_offset)
     return struct.unpack(file.tiff.offsetformat, file.filehandle.read(file.tiff.offsetsize))[0]
 
 
 def _end(page: Any) -> int:
-    """Where the page's last segment ends in the file, bytes."""
+    """Offset at which the page's last segment ends in the file, bytes."""
     segments = zip(page.dataoffsets, page.databytecounts, strict=True)
     return max((offset + length for offset, length in segments), default=0)
 
 
 def _tags(page: Any) -> dict[str, Any]:
-    """Tags by name, those of the EXIF directory too."""
+    """Tags by name, including those of the EXIF directory."""
     tags = {tag.name: tag.value for tag in page.tags.values()}
     return tags | tags.get("ExifTag", {})
 
@@ -91,7 +91,7 @@ def _exposure_s(tags: dict[str, Any]) -> float | None:
 
 
 def _iso(tags: dict[str, Any]) -> float | None:
-    """The ISO; 0 stands for unknown. Some cameras write it twice."""
+    """The ISO; 0 means unknown. Some cameras write it twice."""
     value = tags.get("ISOSpeedRatings", tags.get("PhotographicSensitivity"))
     numbers = set(value) if isinstance(value, tuple) else {value}
     if len(numbers) > 1:

@@ -1,4 +1,4 @@
-"""Read captures: camera raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files to a `FrameStack`."""
+"""Reading captures from camera raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files into a `FrameStack`."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ def load(
 ) -> FrameStack:
     """Read a capture: dark frames, flat frames or both, of one camera at one gain setting.
 
-    Only headers are read now, and of flats one frame a file; frames are read one at a time when the stack is iterated
-    (.npz files are loaded whole). Frames of one kind whose exposures agree to 1e-3 form a group; darks first, short
-    before long; flats of one exposure whose light differs by more than 5 % form several.
-    What is given here overrides what the files say; a warning tells of exposures that differ.
+    Only headers are read now, and one frame per file of flats; other frames are read one at a time when the stack is
+    iterated (.npz files are loaded whole). Frames of one kind whose exposures agree to 1e-3 form a group: darks first,
+    short before long. Flats of one exposure whose light differs by more than 5 % form several groups.
+    Arguments override what the files state; a warning reports exposures that differ.
 
     Frames that do not belong with the others (lights, masters, another format, size, binning, gain, ISO or temperature)
-    are set aside, and flats of another crop go to `elsewhere`; `assumed` of the stack tells of all this.
+    are set aside, and flats of another crop go to `elsewhere`. The stack's `assumed` reports all this.
 
     Args:
-        path: a folder, a glob pattern, one file, or a list of files and folders. A folder's files and those of the
-            folders in it are taken in natural order (frame2 before frame10), files of no known format are passed over.
-            A folder with EMVA1288_Data.txt is read as that says.
-        exposure_s: exposure time, s; one for all, or one a file (one an exposure for a file of several).
-        kind: "dark" or "flat", likewise. None: what the files say, or else their names and those of their folders
+        path: a folder, a glob pattern, one file, or a list of files and folders. Files in and below a folder are read
+            in natural order (frame2 before frame10); files of unknown formats are skipped. In a folder with
+            EMVA1288_Data.txt, that file says what to read.
+        exposure_s: exposure time, s; one for all, or one per file (one per exposure if a file holds several).
+        kind: "dark" or "flat", likewise. None: as the files state, or else by the names of files and folders
             (bias, zero, dark, flat, darkflat, ...), or else "dark".
-        cfa: "mono" or the Bayer order of the first stored pixel. None: what the files say, or "mono".
-        black_level, white_level: DN; black one value or one a channel. None: what the files say; if they say
-            nothing, black is to be estimated and white unknown.
-        shutter: "rolling" or "global". None: what the files say, or "rolling".
+        cfa: "mono" or the Bayer order of the first stored pixel. None: as the files state, or "mono".
+        black_level, white_level: DN; black is one value or one per channel. None: as the files state; if they do
+            not, black is estimated and white unknown.
+        shutter: "rolling" or "global". None: as the files state, or "rolling".
         row_axis: axis of a stored frame that counts sensor rows; 1 for frames stored in portrait.
         roi: ((first row, end row), (first column, end column)) in sensor coordinates, ends excluded; either
             may be None. Odd starts rotate `cfa`.
-        overscan: "auto" takes off rows or columns at the edges that do not follow the light of flats, or that the
-            headers name, and keeps their means in `overscan_dn`; ((first row, end row), (first column, end column)),
-            one of them None, takes off these; None names what is found.
+        overscan: "auto" removes rows or columns at the edges that do not follow the light of flats, or that the
+            headers name, and keeps their means in `overscan_dn`. ((first row, end row), (first column, end column)),
+            one of them None, removes these. None only names what is found.
         progress: show a bar on long reads.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unreadable file, no exposure time, or frames that do not belong together and of which
-            neither are the most; the message names the file. Also whatever `FrameStack` refuses.
+        ValueError: an unreadable file, no exposure time, or frames that do not belong together without a majority;
+            the message names the file. Also all errors of `FrameStack`.
     """
     options = {"cfa": cfa, "black_level": black_level, "white_level": white_level, "shutter": shutter}
     return read_capture(

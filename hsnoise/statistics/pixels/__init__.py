@@ -1,4 +1,4 @@
-"""Single pixels over time: survey, classes, photon transfer pixel by pixel, populations, flags, maps.
+"""Single pixels over time: survey, classes, pixel transfer, populations, flags, maps.
 
 May import `_core`, `frames` and `statistics`.
 """

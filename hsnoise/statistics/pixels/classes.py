@@ -1,7 +1,7 @@
-"""Classes of pixels by how fast their dark level grows: chosen in one half of the frames, measured in the other.
+"""Classes of pixels by the growth of their dark level: chosen in one half of the frames, measured in the other.
 
-In the same frames, or by level instead of growth, chance and offsets would enter class and measurement alike, and the
-gain would come out 15 to 55 % low.
+With the same frames for both, or classes by level instead of growth, chance and offsets would affect class and
+measurement alike, and the gain would come out 15 to 55 % low.
 """
 
 from __future__ import annotations
@@ -14,36 +14,36 @@ import numpy as np
 from hsnoise.statistics.pixels.clipping import unclipped
 from hsnoise.statistics.pixels.survey import Survey
 
-BODY = (0.0, 0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)  # quantiles between which ordinary pixels are classed
+BODY = (0.0, 0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)  # quantiles that bound the classes of ordinary pixels
 TAIL = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 0.9999)
 FEWEST_ALIVE = 200  # pixels of a colour that is not dead
 FEWEST_PIXELS = 20  # of a class
-FAR_FRAME, MANY_FRAMES = 5.0, 6  # deviations of an odd frame; frames whose scatter is known by themselves
-JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure from which pedestals jump between exposures
+FAR_FRAME, MANY_FRAMES = 5.0, 6  # deviations of an odd frame; frames enough to know their own scatter
+JUMPS = 6.0  # chi2 per degree of freedom of levels over exposure above which pedestals jump
 FEWEST_FRAMES = 3  # of an exposure that can be halved
-OUTLIER_SIGMAS = 6.0  # a half of a pixel's frames with such a deviation holds a cosmic hit, or a telegraph jump
+OUTLIER_SIGMAS = 6.0  # a deviation beyond which half of a pixel's frames holds a cosmic hit or a telegraph jump
 LEAST_SCALE_DN = 0.5
-MANY_PIXELS = 500  # of a class whose scatter is known
+MANY_PIXELS = 500  # of a class that are enough to know its scatter
 FILLED = 0.7  # of full scale: above it the response may bend
-HOT_TIMES, HOT_SIGMAS = 3.0, 6.0  # of the median growth, of the chance scatter of a growth: beyond both a pixel is hot
-NEAR_ZERO_SIGMAS = 4.0  # above 0 counts from which clipping takes nothing from the noise
+HOT_TIMES, HOT_SIGMAS = 3.0, 6.0  # times the median growth, and its scatter by chance: beyond both a pixel is hot
+NEAR_ZERO_SIGMAS = 4.0  # above 0 counts: from here on clipping does not reduce the noise
 
 
 @dataclass(frozen=True)
 class Classes:
     """Level and temporal variance of classes of pixels in the dark exposures of one channel.
 
-    Both halves stand one after the other: first the classes chosen in the even frames, measured in the odd ones.
+    Classes chosen in the even frames and measured in the odd ones come first, then the reverse.
 
     Attributes:
-        exposure_s [exposure]: of the dark exposures with two frames at least.
+        exposure_s [exposure]: of the dark exposures with at least two frames.
         level_dn, variance_dn2, error_dn2 [class, exposure]: mean, mean temporal variance, its standard error; error is
             infinite where a class is clipped, too bright, or has too few pixels.
-        pixels [class]: how many.
-        hot [class]: whether beyond the growth of ordinary pixels.
-        limit_dn_per_s: growth from which on pixels are hot.
-        pedestal_sigma_dn [exposure]: how well the common level of an exposure is known, from its frames.
-        outlier_share [exposure]: of the pixels, set apart for an outlier.
+        pixels [class]: number of pixels.
+        hot [class]: whether it grows faster than ordinary pixels.
+        limit_dn_per_s: growth above which pixels are hot.
+        pedestal_sigma_dn [exposure]: standard error of an exposure's common level, from its frames.
+        outlier_share [exposure]: share of the pixels that were set aside for an outlier.
     """
 
     exposure_s: np.ndarray
@@ -58,7 +58,7 @@ class Classes:
 
     @property
     def growth_dn_per_s(self) -> np.ndarray:
-        """Growth of the level of each class [class], in the frames that measure, DN/s."""
+        """Growth of the level of each class [class], in the measuring frames, DN/s."""
         return slope_over(self.exposure_s, self.level_dn.T)
 
 
@@ -116,9 +116,9 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         ]
         grown = [growth[1 - half] for half in measuring]
     else:
-        # Differences do not know of the mean of the same frames; ordinary pixels are one class.
+        # Differences are independent of the mean of the same frames; ordinary pixels are one class.
         mean = growth.mean(0)
-        few = pixels.n_frames[:, None] < 4  # a deviation is at most all of the variance
+        few = pixels.n_frames[:, None] < 4  # with so few frames one deviation can be all of the variance
         peak = np.sqrt(np.maximum(pixels.whole_variance, 0) * (pixels.n_frames[:, None] - 1))
         peak = np.where(few, peak, pixels.peak.max(1))
         members = _members(mean, _edges(mean, limit, False))
@@ -140,14 +140,14 @@ def slope_over(exposure_s: np.ndarray, level: np.ndarray) -> np.ndarray:
 def hot_from(growth: np.ndarray) -> float:
     """Growth [half, pixel] beyond which a pixel is called hot, in DN/s.
 
-    Ordinary dark current is that of many weak generation centres in each pixel; hot pixels hold a strong one.
+    Ordinary dark current comes from many weak generation centres in each pixel; hot pixels hold a strong one.
     """
     median = float(np.median(growth))
     return max(HOT_TIMES * median, median + HOT_SIGMAS * growth_noise(growth))
 
 
 def growth_noise(growth: np.ndarray) -> float:
-    """Standard deviation by chance of the growth of a pixel in one half of the frames [half, pixel], DN/s."""
+    """Standard deviation by chance of a pixel's growth in one half of the frames, DN/s; growth [half, pixel]."""
     apart = growth[0] - growth[1]
     return 1.4826 * float(np.median(np.abs(apart - np.median(apart)))) / np.sqrt(2)
 
@@ -155,7 +155,7 @@ def growth_noise(growth: np.ndarray) -> float:
 def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
     """Standard error of the common level of each exposure, DN: the scatter of its frames' levels, or their drift.
 
-    The scatter is that of the frames of all exposures, few as they are in each; a frame far off does not count.
+    The scatter is pooled over exposures, because each has few frames; outlying frames do not count.
     """
     near, scatter = [], []
     for of in offsets:
@@ -163,21 +163,21 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
         near.append(of[off <= FAR_FRAME * 1.4826 * np.median(off)] if len(of) > 3 else of)
         scatter.append(near[-1].var(ddof=1) if len(near[-1]) > 1 else 0.0)
     dof = np.array([len(of) - 1 for of in near])
-    pooled = float(dof @ scatter / max(dof.sum() - 2, 1))  # of few frames, as wide as Student's t
+    pooled = float(dof @ scatter / max(dof.sum() - 2, 1))  # for few frames, as wide as Student's t
     found = []
     for of, own in zip(offsets, scatter, strict=True):
         half = len(of) // 2
         drift = abs(float(np.median(of[:half]) - np.median(of[half:]))) / 2 if half > 1 else 0.0
         variance = max(pooled, own if len(of) >= MANY_FRAMES else 0.0)
-        # Of noise alone, the halves of n frames differ by 2 deviations over the root of n.
+        # By noise alone, the halves of n frames differ by 2 deviations over the root of n.
         found.append(np.hypot(np.sqrt(variance / len(of)), max(drift - 2 * np.sqrt(variance / len(of)), 0.0)))
     return np.array(found)
 
 
 def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """The errors of levels [exposure], widened where they leave a straight line over exposure that does not fall.
+    """The errors of levels [exposure], widened where the levels do not follow a non-falling straight line of exposure.
 
-    Pedestals jump between exposures then.
+    In that case pedestals jump between exposures.
     """
     weight = 1 / np.maximum(sigma, 1e-6)
     design = np.stack([np.ones_like(exposure_s), exposure_s], 1) * weight[:, None]
@@ -191,7 +191,7 @@ def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) 
 
 
 def _edges(growth: np.ndarray, limit: float, of_body: bool) -> np.ndarray:
-    """Lower edges of the classes: quantiles, and the limit of hot pixels, which no class crosses."""
+    """Lower edges of the classes: quantiles, and the limit of hot pixels, which no class straddles."""
     tail = tuple(q for q in TAIL if len(growth) * (1 - q) > 2 * FEWEST_PIXELS)
     edges = np.quantile(growth, (BODY if of_body else BODY[:1]) + tail)
     if not of_body:
@@ -202,7 +202,7 @@ def _edges(growth: np.ndarray, limit: float, of_body: bool) -> np.ndarray:
 
 
 def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
-    """Numbers of the pixels in each class, classes of few pixels left out."""
+    """Indices of the pixels in each class, without classes of few pixels."""
     number = np.searchsorted(edges, growth, side="right")
     order = np.argsort(number, kind="stable")
     bounds = np.flatnonzero(np.diff(number[order])) + 1
@@ -212,7 +212,7 @@ def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
 def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, full_scale_dn: float):
     """Level, variance, its error [class, exposure], pixels [class], outliers [class, exposure]; the members.
 
-    level, variance, peak [exposure, pixel]: in the frames that measure; other: levels in those that chose. dof
+    level, variance, peak [exposure, pixel]: in the measuring frames; other: levels in the choosing frames. dof
     [exposure]: degrees of freedom of a pixel's variance.
     """
     size = (len(members), len(level))
@@ -244,8 +244,8 @@ def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, f
 def _chance_error(variance: np.ndarray, excess: np.ndarray, floor: float, dof: int) -> float:
     """Standard error of the mean variance of a class [pixel] by chance.
 
-    In a class of few pixels a mean that is low by chance scatters less, too, and would count more: there the error is
-    that of normal noise of the class's mean. Brighter pixels (excess [pixel], in other frames) have more of it.
+    In a small class a mean that is low by chance also scatters less and would get more weight, so its error is that of
+    normal noise of the class's mean. Brighter pixels (excess [pixel], in the other frames) are noisier.
     """
     if len(variance) > MANY_PIXELS:
         return float(variance.std(ddof=1) / np.sqrt(len(variance)))
@@ -256,21 +256,21 @@ def _chance_error(variance: np.ndarray, excess: np.ndarray, floor: float, dof: i
 
 
 def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """Temporal deviation that is usual for each pixel of a class [pixel]: brighter ones are noisier.
+    """Expected temporal deviation of each pixel of a class [pixel]: brighter pixels are noisier.
 
     excess [pixel]: level above that of ordinary pixels, in other frames.
     """
     middle = max(float(np.median(excess)), 1e-6)
     brighter = np.maximum(excess / middle, 1.0) if middle > LEAST_SCALE_DN else 1.0
-    usual = max(float(np.median(variance)), 0.0)  # below 0 by what is taken off of saturated pixels
+    usual = max(float(np.median(variance)), 0.0)  # saturated pixels may fall below 0 after subtraction
     return np.maximum(np.sqrt(usual * brighter), LEAST_SCALE_DN)
 
 
 def _level_scatter(members: list[np.ndarray], level, other, t) -> np.ndarray:
     """Standard deviation of the levels of the pixels of each class at each exposure [class, exposure], DN.
 
-    As measured in large classes; of few pixels, offsets as in the largest class, and the growth that differs between
-    them as their brightest exposure shows it.
+    Large classes are measured. Small classes take the offsets of the largest, and the spread of growth from their
+    brightest exposure.
     """
     measured = np.array([[_scatter(one[m], of[m]) for one, of in zip(level, other, strict=True)] for m in members])
     count = np.array([len(m) for m in members])

@@ -1,7 +1,7 @@
-"""Clipping at 0 taken off the mean and the temporal variance of a class of pixels.
+"""Correcting the mean and temporal variance of a class of pixels for clipping at 0.
 
-A pixel's counts are max(normal, 0). Offsets of the pixels of a class scatter, with a known deviation, so that the
-measured mean and variance are averages over pixels that clip more and less. Two equations, two unknowns.
+A pixel's counts are max(normal, 0). Offsets of the pixels of a class scatter with a known deviation, so the measured
+mean and variance are averages over pixels that clip more or less. Two equations, two unknowns.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from scipy.special import ndtr
 NODES = 15  # over the offsets of a class
 STEPS = 60
 TOLERANCE = 1e-10
-MOST_CLIPPED = 0.4  # share of a class's counts: beyond, what is left says too little
-EDGE_DN = -0.5  # below it a value is rounded to a count that there is not
+MOST_CLIPPED = 0.4  # share of a class's counts: beyond it, too little information is left
+EDGE_DN = -0.5  # values below it would round to a negative count
 
 
 def unclipped(mean: float, variance: float, scatter: float) -> tuple[float, float, float]:
-    """Mean and temporal variance without clipping (DN, DN^2), and by how much an error of the variance grows.
+    """Mean and temporal variance without clipping (DN, DN^2), and the factor by which an error of the variance grows.
 
     mean, variance: of the clipped counts of a class, variance the pixels' average; scatter: standard deviation of the
     pixels' levels, DN. NaN where no normal noise has these moments, or most counts are clipped.
@@ -39,7 +39,7 @@ def unclipped(mean: float, variance: float, scatter: float) -> tuple[float, floa
 
 
 def clipped_moments(level: float, sigma: float, scatter: float) -> tuple[float, float]:
-    """Mean and average variance of max(normal(level + offset, sigma^2), 0) over pixels of normal offsets."""
+    """Mean and average variance of max(normal(level + offset, sigma^2), 0) over pixels with normal offsets."""
     z, weight = np.polynomial.hermite_e.hermegauss(NODES)
     off = level + scatter * z - EDGE_DN
     t = off / sigma
@@ -47,7 +47,7 @@ def clipped_moments(level: float, sigma: float, scatter: float) -> tuple[float, 
     first = off * ndtr(t) + sigma * density
     second = (off**2 + sigma**2) * ndtr(t) + off * sigma * density
     weight = weight / weight.sum()
-    # Clipped values lie at count 0, half a count above the edge.
+    # Clipped values have count 0, half a count above the edge.
     first_dn = first + EDGE_DN + 0.5 * ndtr(-t)
     variance = second + 0.25 * ndtr(-t) - (first + 0.5 * ndtr(-t)) ** 2
     return float(weight @ first_dn), float(weight @ variance)

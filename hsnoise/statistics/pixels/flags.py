@@ -1,4 +1,4 @@
-"""Pixels that are no noise: stuck, dead, hot, telegraph-like; told by what they do over time."""
+"""Flags of defective pixels (stuck, dead, hot, telegraph-like) from their behaviour over time."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hsnoise.statistics.pixels.survey import Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
 DIM = 0.5  # of the median response to light: below it a pixel is dead
-RARE = 1e-3  # chance of a variance so high, in each half of the frames
+RARE = 1e-3  # chance of a variance that high, in each half of the frames
 
 
 def flags_of(found: Survey, channel: int) -> np.ndarray:
-    """Bits of FLAGS of each sampled pixel of one channel [pixel]; those that the frames do not tell are not set."""
+    """Bits of FLAGS of each sampled pixel of one channel [pixel]; flags that the frames cannot show are not set."""
     halves = [[p.halves for p in g.of(channel)] for g in found.groups if g.n_frames > 1]
     if not halves or halves[0][0] is None:
         return np.zeros(0, np.uint8)
@@ -40,7 +40,7 @@ def counts_of(flags: np.ndarray) -> dict[str, float]:
 
 
 def _dead(found: Survey, channel: int) -> np.ndarray:
-    """Pixels that hardly answer to light."""
+    """Pixels that hardly respond to light."""
     flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.of(channel)]) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
@@ -53,7 +53,7 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
 
 
 def _jumping(halves, pixels: int) -> np.ndarray:
-    """Pixels whose variance is far above that of pixels of their level in both halves of the frames of an exposure."""
+    """Pixels much noisier than others of their level, in both halves of an exposure's frames."""
     found = np.zeros(pixels, bool)
     for of in halves:
         dof = np.array(of[0].n_frames) - 1
@@ -68,7 +68,7 @@ def _jumping(halves, pixels: int) -> np.ndarray:
 
 
 def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Typical variance of pixels of about the same level [pixel]: mean below the 90 % quantile, by level."""
+    """Typical variance of pixels of about the same level [pixel]: their mean below the 90 % quantile."""
     edges = np.unique(np.quantile(level, np.concatenate([[0, 0.5, 0.9], 1 - np.geomspace(0.05, 1e-4, 10)])))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, len(edges) - 1)
     typical = np.empty(len(edges))

@@ -20,13 +20,13 @@ from hsnoise.statistics.pixels.survey import Survey, survey
 
 @dataclass(frozen=True)
 class PixelMaps:
-    """What each pixel of a sensor does [row, column].
+    """Maps of a sensor's pixels [row, column].
 
     Attributes:
         offset_dn: level without signal, DN.
         dark_current: in `dark_current_unit`, e-/s, or DN/s where the gain is not determined; NaN with one exposure.
         noise_dn: temporal noise at the shortest exposure, DN.
-        flags: bits of `hsnoise.pixels.flags.FLAGS`: 1 stuck, 2 dead, 4 hot, 8 telegraph-like.
+        flags: bits of `hsnoise.statistics.pixels.flags.FLAGS`: 1 stuck, 2 dead, 4 hot, 8 telegraph-like.
     """
 
     offset_dn: np.ndarray
@@ -38,7 +38,7 @@ class PixelMaps:
     def save(self, path: str | os.PathLike) -> None:
         """Write the maps to a .npz or .fits file, whole or not at all.
 
-        Raises ValueError for another ending.
+        Raises ValueError for any other suffix.
         """
         suffix = Path(path).suffix.lower()
         if suffix not in (".npz", ".fits"):
@@ -66,7 +66,7 @@ class PixelMaps:
 
 
 def pixel_maps(stack: FrameStack, gain: np.ndarray | None) -> PixelMaps:
-    """The maps of a stack with darks, in bands of rows that fit into memory.
+    """The maps of a stack with darks, made in bands of rows that fit into memory.
 
     gain [channel], DN/e-, or None where it is not determined. Raises ValueError without two frames of a dark exposure.
     """

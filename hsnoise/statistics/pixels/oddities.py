@@ -1,4 +1,4 @@
-"""Frames, lines and pixels of a capture that are no measurement of the sensor's noise, in sentences."""
+"""Sentences on frames, rows, columns and pixels of a capture that do not measure the sensor's noise."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise._core.naming import setting
 from hsnoise.statistics.pixels.flags import counts_of, flags_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 ODD_LEVEL, ODD_NOISE = 8.0, 0.25  # deviations of a frame's level; share by which its noise differs from the others'
 LEAST_LEVEL_DN = 0.5
-MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that are worth a sentence
-QUIET = 0.05  # of the other colours' noise: a colour that is dead
+MANY = {"stuck": 5e-4, "telegraph": 5e-4}  # shares of pixels that deserve a sentence
+QUIET = 0.05  # of the other colours' noise: below it a colour is dead
 LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel's noise
-LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # of that signal over pixels: less is simulated, more is dark current
-SMOOTHED = 0.1  # of the noise, that neighbouring pixels share
-FEWEST = 3  # frames, of which one can be told to be odd
+LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # relative, of that signal over pixels: less is simulated, more is dark current
+SMOOTHED = 0.1  # share of the noise that neighbouring pixels have in common
+FEWEST = 3  # frames among which an odd one can be found
 
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
-    """What is wrong with frames, lines and colours, most important first."""
+    """What is wrong with frames, rows, columns and colours, most important first."""
     return (*_frames(found), *_lines(found), *_colours(found), *_smoothed(found))
 
 
@@ -37,7 +38,7 @@ def _frames(found: Survey) -> Iterator[str]:
         off = level - np.median(level)
         scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
         pixel = float(np.median(noise))
-        lit = group.kind == "flat"  # flicker is taken off flats
+        lit = group.kind == "flat"  # flicker is removed from flats
         for f in () if lit else np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
             side = "brighter" if off[f] > 0 else "darker"
             yield (
@@ -55,10 +56,10 @@ def _lines(found: Survey) -> Iterator[str]:
     for group in found.groups[:1]:
         odd = group.odd_lines
         if any(p.narrow_dn is not None for p in group.planes):
-            return  # lines of one count are no wonder
+            return  # rows with a single count are normal here
         for what, lines in (("rows", odd.constant_rows), ("columns", odd.constant_columns)):
             if len(lines):
-                yield f"{_listed(what, lines)} have one count throughout: they are dead, or padding. Crop them (roi)."
+                yield f"{_listed(what, lines)} have one count only: they are dead, or padding. Crop them (roi)."
         if len(odd.repeated_rows):
             yield f"{_listed('rows', odd.repeated_rows)} repeat the row before: they are padding. Crop them (roi)."
 
@@ -83,7 +84,7 @@ def _colours(found: Survey) -> Iterator[str]:
 
 def _smoothed(found: Survey) -> Iterator[str]:
     """Noise that neighbours share: a pixel's variance is then no measure of its electrons."""
-    # Darks only: light that differs between two flats brings their pattern into what changes.
+    # Darks only: if light differs between two flats, their pattern changes, too.
     planes = [(plane.neighbours_share, group) for group in found.repeated_darks for plane in group.planes]
     wide = [one for one in planes if one[1].noise_dn > LEAST_LEVEL_DN]
     share, group = max(wide, key=lambda one: one[0], default=(0.0, None))
@@ -95,7 +96,7 @@ def _smoothed(found: Survey) -> Iterator[str]:
 
 
 def lit_darks(found: Survey) -> Iterator[str]:
-    """Darks whose pixels rise nearly alike, as light makes them; dark currents differ by far more."""
+    """Darks whose pixels rise almost equally, as under light; dark currents differ by far more."""
     first = found.shortest
     for c, channel in enumerate(found.channels if first is not None else ()):
         of = "" if channel == "mono" else f" of channel {channel}"
@@ -109,8 +110,9 @@ def lit_darks(found: Survey) -> Iterator[str]:
             spread = np.sqrt(max(common, 0.0)) / max(rise, 1e-9)
             if rise > max(LIT_DN, LIT_NOISES * group.noise_dn) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
                 yield (
-                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN and differ in that by {spread:.2g}"
-                    " of it: dark currents differ by more. Did light get in, or are they flats (kind='flat')?"
+                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN with a spread of only {spread:.2g}"
+                    f" of it: dark currents differ by more. Did light get in, or are they flats"
+                    f" ({setting('kind', 'flat')})?"
                 )
                 break
 
@@ -121,16 +123,16 @@ def _levels(group: Group, c: int) -> np.ndarray:
 
 
 def pixels_apart(found: Survey) -> Iterator[str]:
-    """Shares of pixels that are no noise: stuck, dead, telegraph-like."""
+    """Shares of defective pixels: stuck, dead, telegraph-like."""
     for c, channel in enumerate(found.channels):
         shares = counts_of(flags_of(found, c))
         of = "" if channel == "mono" else f" of channel {channel}"
         if shares["stuck"] > MANY["stuck"]:
-            yield f"{100 * shares['stuck']:.2g} % of the pixels{of} never change: they are stuck, and are no noise."
+            yield f"{100 * shares['stuck']:.2g} % of the pixels{of} never change: they are stuck, and not noise."
         if shares["telegraph"] > MANY["telegraph"]:
             yield (
                 f"{100 * shares['telegraph']:.2g} % of the pixels{of} are far noisier than others of their level"
                 " (telegraph-like)."
             )
         if shares["dead"] > MANY["stuck"]:
-            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly answer to light: they are dead, or overscan."
+            yield f"{100 * shares['dead']:.2g} % of the pixels{of} hardly respond to light: they are dead, or overscan."

@@ -1,9 +1,9 @@
-"""How pixels differ: the distribution of dark current and of offsets over pixels, the noise of estimation taken off.
+"""How pixels differ: the distributions of dark current and offsets over pixels, without the noise of estimation.
 
-Dark current is modelled as the effects that draw it: log-normal, and in a fraction of hot pixels an exponential extra
-(`dark_current_nonuniformity`, `hot_pixels`), fitted to the measured growth of all pixels by maximum likelihood; the
-known noise of a pixel's growth is part of the distribution. Offsets are normal, from the covariance of two halves of
-the frames, which noise does not enter.
+Dark current is modelled like the effects that draw it: log-normal (`dark_current_nonuniformity`), with an exponential
+extra in a fraction of pixels (`hot_pixels`). It is fitted to the measured growth of all pixels by maximum likelihood,
+with the known noise of a pixel's growth as part of the distribution. Offsets are normal; their variance is the
+covariance of two halves of the frames, which noise does not enter.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from scipy.special import erfcx, ndtr
 
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
 
-NODES = 48  # of the log-normal distribution, or of the noise where that is the narrower one
-WIDE = 0.5  # of the log-normal width: noise from which on it is the wider one
+NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
+WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
-APART_SIGMAS, APART_SHARE = 6.0, 0.3  # growth in two halves that disagrees by more is a hit or a jump, not a growth
-SIGNIFICANT = 15.0  # twice the gain in log-likelihood from which pixels differ in dark current
+APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by more, it is a hit or a jump
+SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ in dark current
 LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
 MOST_HOT = 0.3
-FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames, too
+FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Population:
     """Dark current of the pixels of one channel, DN/s, and offsets, DN; each value with its standard error.
 
     Attributes:
-        mean: of ordinary pixels, whatever the limit at which others are called hot.
+        mean: of ordinary pixels, independent of the limit above which pixels are called hot.
         spread: of ln dark current of ordinary pixels (0: they do not differ).
-        hot_fraction, hot_rate: share of hot pixels (0: none), mean of their extra dark current:
-            with it the mean over all pixels is the measured one.
-        at_readout: extra charge of hot pixels whatever the exposure, mean, DN.
-        offset_sigma: standard deviation of offsets over pixels, rows and columns taken off.
+        hot_fraction, hot_rate: share of hot pixels (0: none), and mean of their extra dark current, such that
+            the mean over all pixels is the measured one.
+        at_readout: mean extra charge of hot pixels that is independent of exposure, DN.
+        offset_sigma: standard deviation of offsets over pixels, without those of rows and columns.
         median, quantiles: of the measured growth, DN/s; quantiles at 1, 16, 84, 99, 99.9 %.
         noise: standard deviation by chance of the growth of one pixel, DN/s.
     """
@@ -59,12 +59,12 @@ def population_of(
     """The population of one channel.
 
     Args:
-        pixels: of `levels_of`.
-        limit: growth from which on pixels were called hot, DN/s; ordinary: mean growth of those below it, pedestals
-            taken off.
+        pixels: from `levels_of`.
+        limit: growth above which pixels were called hot, DN/s; ordinary: mean growth of those below it, without
+            pedestals.
         pedestal_dn_per_s: what moving pedestals add to every pixel's growth.
-        pattern [half, pixel]: offset of each pixel less its row and column, DN, at the shortest exposure.
-        low_side_dn: standard deviation of offsets as pixels below the median show it.
+        pattern [half, pixel]: offset of each pixel minus its row and column, DN, at the shortest exposure.
+        low_side_dn: standard deviation of offsets, from pixels below the median.
     """
     halves = slope_over(pixels.exposure_s, pixels.level) - pedestal_dn_per_s
     noise = growth_noise(halves) / np.sqrt(2)
@@ -72,17 +72,17 @@ def population_of(
     apart = np.abs(halves[0] - halves[1])
     steady = (apart < APART_SIGMAS * 2 * noise) | (apart < APART_SHARE * 2 * np.abs(growth))
     growth = growth[steady].astype(np.float64)
-    # A pedestal that falls by more than dark signal rises is common to all pixels: they are measured from there.
+    # A pedestal that falls faster than the dark signal rises is common to all pixels: growth is measured from it.
     fallen = min(float(np.median(growth)), 0.0)
     values, errors = _fitted(growth - fallen, noise)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[2:], errors[2:] = 0.0, np.inf
     body, spread, fraction, rate = values
-    # The log-normal tail beyond the limit belongs to the ordinary pixels, hot ones below it do not.
+    # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
     cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
     beyond = body - cut if spread > 0 or fraction > 0 else 0.0
     mean = ordinary + beyond
-    if fraction > 0:  # whatever the shape of the tail, its charge is kept; moving pedestals are in both means
+    if fraction > 0:  # keeps the tail's charge for any shape of it; moving pedestals are in both means
         total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
         measured = float(growth[growth < limit - pedestal_dn_per_s].mean()) + beyond
         rate = max((total - measured) / fraction, 0.0)
@@ -102,7 +102,7 @@ def population_of(
 
 
 def _hot_again(halves: np.ndarray, limit: float) -> bool:
-    """Whether pixels that are hot in one half of the frames are so in the other: jumps and hits are not."""
+    """Whether pixels that are hot in one half of the frames are hot in the other, unlike jumps and hits."""
     once = halves[0] > limit
     return bool(once.sum() > FEWEST_HOT and np.mean(halves[1][once] > limit / 2) > HOT_AGAIN)
 
@@ -115,14 +115,14 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
 
 
 def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
-    """Share of pixels whose measured growth is below x: log-normal, in a fraction plus exponential, plus noise."""
+    """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise."""
     z, weight = np.polynomial.hermite_e.hermegauss(NODES)
     weight = weight / weight.sum()
     body = mean * np.exp(spread * z - spread**2 / 2)
     off = (x[:, None] - body) / noise
     if noise > WIDE * spread * mean:
         plain = ndtr(off) @ weight
-    else:  # between nodes of the log-normal distribution, narrow noise would leave steps
+    else:  # narrow noise would leave steps between the nodes of the log-normal distribution
         left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
         plain = ndtr(np.log(left) / spread + spread / 2) @ weight
     if fraction > 0:
@@ -132,7 +132,7 @@ def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction
 
 
 def _exponential_share(off: np.ndarray, ratio: float) -> np.ndarray:
-    """By how much an exponential extra of noise over `ratio` lowers the normal distribution function at `off`."""
+    """How much an exponential extra of mean noise / `ratio` lowers the normal distribution function at `off`."""
     # exp(ratio^2 / 2 - ratio off) ndtr(off - ratio), without overflow.
     inner = (ratio - off) / np.sqrt(2)
     low = 0.5 * np.exp(-0.5 * off**2) * erfcx(np.maximum(inner, -25.0))
@@ -150,7 +150,7 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
     def natural(theta: np.ndarray) -> tuple[float, float, float, float]:
-        if middle <= 0:  # no dark current of ordinary pixels, which could differ
+        if middle <= 0:  # ordinary pixels have no dark current that could differ
             theta = np.array([0.0, np.log(1e-3), *theta[2:]])
         return _natural(theta, core)
 
@@ -184,7 +184,7 @@ def _natural(theta: np.ndarray, core: float) -> tuple[float, float, float, float
 
 
 def _refit(loss, theta: np.ndarray, held: int) -> float:
-    """Least loss with one number held."""
+    """The lowest loss with one parameter fixed."""
     free = [i for i in range(len(theta)) if i != held]
 
     def partial(some: np.ndarray) -> float:
@@ -196,7 +196,7 @@ def _refit(loss, theta: np.ndarray, held: int) -> float:
 
 
 def _errors(loss, theta: np.ndarray) -> np.ndarray:
-    """Standard errors from the curvature of the loss; infinite where it has none."""
+    """Standard errors from the curvature of the loss; infinite where it is flat."""
     n, step = len(theta), 0.02
     hessian = np.empty((n, n))
     unit = step * np.eye(n)
@@ -210,9 +210,9 @@ def _errors(loss, theta: np.ndarray) -> np.ndarray:
 
 
 def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
-    """Standard deviation of offsets from two halves of the frames [half, pixel], what dark current makes taken off.
+    """Standard deviation of offsets from two halves of the frames [half, pixel], without the part of dark current.
 
-    At most that of the pixels below the median: warm pixels are no normal offsets.
+    At most that of the pixels below the median: warm pixels are not normal offsets.
     """
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
     a, b = np.clip(pattern, -width, width).astype(np.float64)
@@ -224,7 +224,7 @@ def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) 
 
 
 def _at_readout(pixels: Levels, halves: np.ndarray, noise: float, rate: float) -> tuple[float, float]:
-    """Extra offset of the hottest pixels, in proportion to their growth, times the mean rate; with its error, DN."""
+    """Extra offset of the hottest pixels per growth, times the mean rate; with its error, DN."""
     if rate <= 0:
         return 0.0, np.inf
     median = np.median(halves)

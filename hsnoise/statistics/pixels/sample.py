@@ -1,4 +1,4 @@
-"""A part of the pixels in memory, all frames of one exposure, and what two halves of the frames say of each."""
+"""A sample of the pixels in all frames of one exposure, and each pixel's statistics in two halves of the frames."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_PIXELS = 1 << 21  # of an exposure that are looked at one by one
+MOST_PIXELS = 1 << 21  # sampled pixels of an exposure
 MOST_OF_ALL = 1 << 22  # of all exposures together
 MOST_COUNTS = 1 << 24  # pixels times frames of one exposure in memory
-MOST_OF_SPREAD = 100_000  # pixels that tell the width of a distribution
-CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from what lies within
-FAR_FRAME = 5.0  # deviations of the frames' offsets from which one of them is an outlier
-OUTLYING = 6.0  # deviations of a pixel's temporal variance that is no noise of it
-FEWEST_ROWS = 24  # that tell the offset of a column in a frame
+MOST_OF_SPREAD = 100_000  # pixels from which the width of a distribution is taken
+CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from the values within
+FAR_FRAME = 5.0  # deviations beyond which a frame's offset is an outlier
+OUTLYING = 6.0  # deviations beyond which a pixel's temporal variance is not its noise
+FEWEST_ROWS = 24  # enough for the offset of a column in a frame
 
 
 def sampled_rows(shape: tuple[int, int], cell: int, exposures: int, most_frames: int) -> np.ndarray:
-    """Numbers of the sensor rows that are looked at: all of a small frame, evenly spread (pairs) of a large one."""
+    """Numbers of the sampled sensor rows: all rows of a small frame, evenly spread (pairs) of a large one."""
     most = min(MOST_PIXELS, MOST_OF_ALL // max(exposures, 1), MOST_COUNTS // max(most_frames, 1))
     cells = shape[0] // cell
     kept = max(1, min(cells, most // (cell * shape[1])))
@@ -27,9 +27,9 @@ def sampled_rows(shape: tuple[int, int], cell: int, exposures: int, most_frames:
 
 @dataclass(frozen=True)
 class Halves:
-    """What two halves of the frames (even and odd ones) say of each pixel of one plane and exposure.
+    """Statistics of each pixel of one plane and exposure in two halves of the frames (even and odd).
 
-    Offsets that a whole frame, or a row or column of it, has in common are taken off.
+    Common offsets of a frame, and of a row or column in it, are subtracted.
 
     Attributes:
         n_frames: of each half (2).
@@ -37,7 +37,7 @@ class Halves:
         variance_dn2 [half, pixel]: unbiased temporal variance, DN^2; NaN where a half has one frame.
         peak_dn [half, pixel]: largest deviation from the mean, DN.
         lowest, highest [pixel]: extreme counts of all frames, DN.
-        frame_means_dn [frame]: level of each frame beside that of the typical one, DN.
+        frame_means_dn [frame]: level of each frame relative to the typical one, DN.
         pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
         frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
     """
@@ -54,18 +54,18 @@ class Halves:
 
 
 def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
-    """What two halves of the frames say alike of the pixels [pixel]: it is free of the noise of estimation."""
+    """Covariance over pixels of two halves of the frames [pixel]: free of the noise of estimation."""
     return float(((a - a.mean()) * (b - b.mean())).mean())
 
 
 def without_outliers(variance: np.ndarray, n_frames: int) -> np.ndarray:
-    """Temporal variances [pixel] over so many frames, without those that are no noise of their pixel."""
+    """Temporal variances [pixel] over so many frames, without outliers."""
     typical = float(np.median(variance)) + 1e-6
     return variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (n_frames - 1))) ** 2]
 
 
 def halves_of(counts: np.ndarray) -> Halves:
-    """Halves of the counts [frame, row, column] of one plane, two frames at least."""
+    """Halves of the counts [frame, row, column] of one plane, at least two frames."""
     n = len(counts)
     lowest, highest = counts.min(0).ravel(), counts.max(0).ravel()
     values = counts.astype(np.float32)
@@ -80,11 +80,10 @@ def halves_of(counts: np.ndarray) -> Halves:
 
 
 def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
-    """Take the offsets of frames, of rows and of columns in a frame off `values` in place.
+    """Subtract the offsets of frames, and of rows and columns in a frame, from `values` in place.
 
-    Those of a pixel come from the other pixels of its row and column, so that no part of its own noise goes with them,
-    however noisy it is. Returns the offsets of the frames, and the variance that the offsets' own noise adds to each
-    pixel, DN^2.
+    A pixel's offsets come from the other pixels of its row and column, so that none of its own noise is subtracted.
+    Returns the offsets of the frames, and the variance that the offsets' own noise adds to each pixel, DN^2.
     """
     n, h, w = values.shape
     mean = values.mean(0)
@@ -114,13 +113,13 @@ def _typical(offsets: np.ndarray) -> float:
 
 
 def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
-    """Mean of what lies near the median."""
+    """Mean of the values near the median."""
     middle = np.float32(np.median(rest[:: max(1, len(rest) // 64)]))
     return float(np.clip(rest, middle - CORE_SIGMAS * spread, middle + CORE_SIGMAS * spread).mean(dtype=np.float64))
 
 
 def _core_spread(rest: np.ndarray) -> np.float32:
-    """Half the distance of the 16 % and 84 % quantiles: hot pixels and cosmic rays hardly move it."""
+    """Half the distance between the 16 % and 84 % quantiles, which hot pixels and cosmic rays hardly move."""
     thin = rest.ravel()[:: max(1, rest.size // MOST_OF_SPREAD)]
     low, high = np.quantile(thin, (0.1587, 0.8413))
     return np.float32((high - low) / 2)

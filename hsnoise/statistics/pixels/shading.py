@@ -1,4 +1,4 @@
-"""A black level that drifts along a line or a frame: the smooth part of the static means of columns or rows."""
+"""A black level that drifts along a row or down the frame: the smooth part of the static column or row means."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ THERE = 5.0  # standard errors
 
 
 class Shading(NamedTuple):
-    """Exponential drift of the means of lines: rms and its error, DN, length in frames, where steepest, its sign."""
+    """Exponential drift of row or column means: rms and its error, DN, length in frames, where steepest, its sign."""
 
     amplitude_dn: float
     error_dn: float
@@ -22,7 +22,7 @@ class Shading(NamedTuple):
 
 
 def shading_of(means_dn: np.ndarray, noise_dn: float) -> Shading | None:
-    """The shading of the static means of lines [line], DN; None if it explains too little of them.
+    """The shading of static row or column means [n], DN; None if it explains too little of them.
 
     noise_dn: standard error of each mean.
     """

@@ -1,4 +1,4 @@
-"""Whether pixels differ: static structure of single pixels, beside rows, columns and smooth shading."""
+"""Whether pixels differ: static structure of single pixels beyond rows, columns and smooth shading."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
 SIGNIFICANT = 5.0  # standard errors
-SMALL_SHARE = 0.01  # of the temporal variance: static structure below it does not bend a fit that pools pixels
+SMALL_SHARE = 0.01  # of the temporal variance: less static structure does not bias a fit that pools pixels
 GROWN = 0.1  # of the variance of the shortest exposure
-HITS = 10.0  # temporal variance of all pixels over that of the typical one
+HITS = 10.0  # ratio of the mean temporal variance to that of the typical pixel
 SMALL_PATTERN = 0.001  # of the temporal variance
-MANY_HOT = 0.003  # share of hot pixels that a component for outliers does not describe
-STREAKS = 0.05  # growth of the variance of row means over that of pixels from which streaks rule the noise
-CLIPPED = 0.6  # share of clipped counts from which the moments of pixels over time say too little of the noise
+MANY_HOT = 0.003  # share of hot pixels that is too large for a component of outliers
+STREAKS = 0.05  # growth of the variance of row means over that of pixels, above which streaks dominate
+CLIPPED = 0.6  # share of clipped counts above which moments over time say too little about the noise
 
 
 class Static(NamedTuple):
@@ -31,7 +31,7 @@ class Static(NamedTuple):
 
 
 def static_of(found: Survey, group: Group, channel: int) -> Static | None:
-    """The static variance of the pixels of one channel in one exposure; None where halves of the frames do not tell."""
+    """The static variance of the pixels of one channel in one exposure; None if frames are too few to halve."""
     planes = group.of(channel)
     if group.n_frames < 2:
         return None
@@ -51,7 +51,7 @@ def plane_rows(found: Survey) -> float:
 
 
 def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
-    """What pixels of blocks of 2 x 2 differ by beyond rows and columns [half, block], with the variance of a pixel.
+    """Differences of pixels in 2 x 2 blocks beyond rows and columns [half, block], with the variance of a pixel.
 
     level [half, pixel]: of `rows` rows. Smooth shading, row and column patterns cancel.
     """
@@ -63,9 +63,9 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
 
 
 def low_side_sigma(level: np.ndarray, rows: float) -> float:
-    """Standard deviation of the offsets of pixels [half, pixel] as those below the median show it, DN.
+    """Standard deviation of the offsets of pixels [half, pixel], from those below the median, DN.
 
-    Warm pixels stand above it only; row and column medians are taken off, the noise of estimation by the two halves.
+    Warm pixels only lie above it. Row and column medians are subtracted; two halves remove the noise of estimation.
     """
     maps = level.reshape(2, int(rows), -1).astype(np.float64)
     mean = maps.mean(0)
@@ -78,14 +78,14 @@ def low_side_sigma(level: np.ndarray, rows: float) -> float:
 
 
 def covariance_terms(pattern: np.ndarray) -> np.ndarray:
-    """Products of two halves [half, place], winsorised, whose mean is the variance of what both share."""
+    """Winsorised products of two halves [half, place], whose mean is the variance of what both share."""
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
     a, b = np.clip(pattern, -width, width).astype(np.float64)
     return (a - a.mean()) * (b - b.mean())
 
 
 def pixels_differ(found: Survey) -> bool:
-    """Whether static structure of single pixels is significant, and large beside what changes from frame to frame."""
+    """Whether static structure of single pixels is significant, and large compared with temporal noise."""
     for c in range(len(found.channels)):
         for group in found.darks:
             one = static_of(found, group, c)
@@ -105,7 +105,7 @@ def variance_grows(found: Survey) -> bool:
             variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)])
             middle = float(np.median(variance))
             width = 1.4826 * float(np.median(np.abs(variance - middle)))
-            # Of few frames the median lies below the mean, by the same factor in all pixels.
+            # With few frames the median lies below the mean, by the same factor for all pixels.
             share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
             ends.append((middle / share, 1.25 * width / share / np.sqrt(len(variance))))
         (low, low_error), (high, high_error) = ends
@@ -115,7 +115,7 @@ def variance_grows(found: Survey) -> bool:
 
 
 def full_of_hits(found: Survey) -> bool:
-    """Whether what changes is mostly hits in a few pixels: a likelihood with a share of outliers does better then."""
+    """Whether temporal noise is mostly hits in a few pixels, which a likelihood with outliers fits better."""
     planes = [p for g in found.darks if g.n_frames > 1 for p in g.planes]
     typical = [float(np.median(p.halves.pair_variance_dn2)) for p in planes]
     changing = [p.components["temporal"].variance_dn2 for p in planes]
@@ -123,7 +123,7 @@ def full_of_hits(found: Survey) -> bool:
 
 
 def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
-    """Two dark exposures in order, of which the longer is darker by more than a pixel's noise, and how much."""
+    """A shorter and a longer dark exposure, the longer darker by more than a pixel's noise, and by how much."""
     darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     for one, other in zip(darks, darks[1:], strict=False):
         if other.exposure_s == one.exposure_s:
@@ -137,7 +137,7 @@ def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
 
 
 def noise_spread(found: Survey, channel: int) -> float:
-    """Relative standard deviation over pixels of the temporal variance at the shortest exposure, by two halves."""
+    """Relative spread over pixels of the temporal variance at the shortest exposure, from two halves."""
     groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
     if not groups:
         return 0.0
@@ -149,7 +149,7 @@ def noise_spread(found: Survey, channel: int) -> float:
 
 
 def has_patterns(found: Survey) -> bool:
-    """Whether frames, rows or columns of the shortest darks share what no gain of rows makes."""
+    """Whether the shortest darks have frame, row or column patterns that a row gain cannot make."""
     for plane in found.shortest.planes if found.shortest is not None else ():
         noise = plane.components["temporal"].variance_dn2
         for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
@@ -160,7 +160,7 @@ def has_patterns(found: Survey) -> bool:
 
 
 def _always_bright(found: Survey, channel: int) -> float:
-    """Share of pixels that stand out in every frame of the longest exposure: hits and jumps do not."""
+    """Share of pixels that stand out in every frame of the longest exposure, unlike hits and jumps."""
     several = found.repeated_darks
     if not several:
         return 0.0
@@ -172,11 +172,11 @@ def _always_bright(found: Survey, channel: int) -> float:
 
 
 def can_be_transferred(found: Survey) -> bool:
-    """Whether pixels over time show their noise: hardly clipped, and not ruled by streaks of rows."""
+    """Whether pixels over time show their noise: they are hardly clipped, and row streaks do not dominate."""
     groups = found.repeated_darks
     if not groups or max(g.clipped_share.max() for g in groups) > CLIPPED:
         return False
-    # Offsets of rows are taken off; a gain of rows grows with the signal, and changes the noise within them.
+    # Row offsets are subtracted, but a row gain grows with the signal and changes the noise within rows.
     streaks = [[p.components["row_x_frame"].variance_dn2 for p in g.planes] for g in groups]
     noise = [[p.components["temporal"].variance_dn2 for p in g.planes] for g in groups]
     grown = np.array(streaks) - np.min(streaks, axis=0)

@@ -1,4 +1,4 @@
-"""One pass over a stack: the noise decomposition of each exposure and colour, and halves of a part of its pixels."""
+"""One pass over a stack: the noise decomposition of each exposure and colour, and halves of its sampled pixels."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from hsnoise.statistics.decomposition import COMPONENTS, Component, PlaneSums, o
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
-NOISY_DN = 0.5  # temporal deviation from which a pixel that never changes is stuck
+NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
-NARROW_DN2 = 0.25  # temporal variance below which rounding is no noise of 1/12 DN^2
+NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN^2
 
 
 @dataclass(frozen=True)
 class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
-    rows_together: what rows next to each other share in a frame.
+    rows_together: covariance of neighbouring rows in a frame.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
-    narrow_dn: of noise narrower than a count an estimate and an upper bound, DN; None of wider noise.
+    narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
     """
 
     channel: int
@@ -40,7 +40,7 @@ class Plane:
 
 
 class OddLines(NamedTuple):
-    """Lines of the first frame of a group that are no measurement: [line] numbers on the sensor."""
+    """Numbers of the rows and columns in a group's first frame that are not measurements."""
 
     constant_rows: np.ndarray
     constant_columns: np.ndarray
@@ -48,7 +48,7 @@ class OddLines(NamedTuple):
 
     @staticmethod
     def of(frame: np.ndarray, step: int) -> OddLines:
-        """Rows and columns of one count throughout, and rows that repeat the one before of the same colours."""
+        """Rows and columns with a single count, and rows that repeat the previous row of the same colours."""
         rows, columns = np.ptp(frame, axis=1) == 0, np.ptp(frame, axis=0) == 0
         repeated = np.zeros(len(frame), bool)
         repeated[step:] = (frame[step:] == frame[:-step]).all(1) & ~rows[step:]
@@ -57,7 +57,7 @@ class OddLines(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """One exposure: how it was taken, shares of clipped and saturated counts [channel], and its planes."""
+    """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes."""
 
     exposure_s: float
     kind: str
@@ -73,14 +73,14 @@ class Group:
 
     @property
     def noise_dn(self) -> float:
-        """Temporal noise of the typical pixel, two frames or more; 0 where rounding hides it."""
+        """Temporal noise of the typical pixel, from two or more frames; 0 where rounding hides it."""
         variance = np.concatenate([plane.halves.pair_variance_dn2 for plane in self.planes if plane.halves is not None])
         return float(np.sqrt(max(float(np.median(variance)), 0.0)))
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What one pass over a stack keeps: its groups, which rows [row] the sampled pixels come from, and the shape."""
+    """The result of one pass over a stack: its groups, the rows [row] of the sampled pixels, and the shape."""
 
     groups: tuple[Group, ...]
     channels: tuple[str, ...]
@@ -90,14 +90,14 @@ class Survey:
     full_scale_dn: float
 
     def stuck(self, channel: int) -> np.ndarray:
-        """Sampled pixels of a channel [pixel] that have the same count in all frames of the groups that are noisy."""
+        """Sampled pixels of a channel [pixel] with the same count in all frames of the noisy groups."""
         halves = [[p.halves for p in g.of(channel)] for g in self.groups if g.n_frames > 1]
         still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
         noisy: list[bool] = [
             bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves
         ]
         frames = np.sum([of[0].n_frames for of, loud in zip(halves, noisy, strict=True) if loud])
-        if frames < FEWEST_STILL:  # few may agree by chance
+        if frames < FEWEST_STILL:  # so few may agree by chance
             return np.zeros(len(still[0]) if still else 0, bool)
         return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
 
@@ -107,7 +107,7 @@ class Survey:
 
     @property
     def repeated_darks(self) -> tuple[Group, ...]:
-        """The dark exposures of two frames or more: only these tell what stays from what changes."""
+        """The dark exposures of two or more frames: only these separate static from temporal."""
         return tuple(group for group in self.darks if group.n_frames > 1)
 
     @property
@@ -139,7 +139,7 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
 
 
 def _full_scale(highest: int) -> float:
-    """The code at which counts end: that of a converter of 8, 10, 12, 14 bits if some reach it, else of 16 or more."""
+    """The highest code: that of a converter of 8, 10, 12 or 14 bits if counts reach it, else of 16 or more."""
     if highest in (2**b - 1 for b in (8, 10, 12, 14)):
         return float(highest)
     return float(max(2**16 - 1, highest))
@@ -166,7 +166,7 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
             pixels[c] += plane.size
         highest = max(highest, int(frame.max()))
         tick()
-    assert kept is not None and odd is not None  # a group has a frame: FrameStack
+    assert kept is not None and odd is not None  # FrameStack has no empty groups
     planes = tuple(
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
     )
@@ -193,7 +193,7 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
 
 
 def _neighbours_share(counts: np.ndarray) -> float:
-    """Correlation over a row of what changes from the first frame to the second, outliers and lines left out."""
+    """Correlation along rows of the change between the first two frames, without outliers and row offsets."""
     if len(counts) < 2:
         return float("nan")
     change = counts[1].astype(np.float32) - counts[0]
@@ -206,14 +206,14 @@ def _neighbours_share(counts: np.ndarray) -> float:
 
 
 def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
-    """Estimate and upper bound of noise that is narrower than a count, DN; None of wider noise."""
+    """Estimate and upper bound of noise narrower than a count, DN; None for wider noise."""
     if halves is None or not 0 < float(halves.pair_variance_dn2.mean()) < NARROW_DN2:
         return None
     return narrow_read_noise(counts)
 
 
 def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple[int, int]) -> dict[str, Component]:
-    """Standard errors of what pixels carry from the pixels themselves: their noise differs, and has tails."""
+    """Components with errors taken from the pixels themselves, whose noise differs and has tails."""
     if halves is None:
         return found
     level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, shape[1])

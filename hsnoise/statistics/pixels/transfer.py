@@ -1,17 +1,17 @@
-"""Pixel transfer: the gain from darks whose pixels differ, by the variance of single pixels over time.
+"""Pixel transfer: the gain from darks whose pixels differ, from the variance of single pixels over time.
 
 The mean level m[c, e] and the temporal variance v[c, e] of class c in exposure e obey
 
     v[c, e] = a[c] + K (m[c, e] - m0[c] - p[e]) + K (F - 1) x[c, e],
 
-m0[c] being the level without signal, a[c] the variance there, p[e] how far the pedestal of the exposure has moved,
-known as well as its frames agree, x[c, e] the signal of hot pixels beyond that of ordinary ones (0 for these), and F
-the Fano factor of hot pixels. A pedestal moves all classes alike, so pixels of different growth tell the gain
-whatever it does. Weighted least squares: the equation is linear in a, K, K p and K F.
+where m0[c] is the level without signal, a[c] the variance there, p[e] the shift of the exposure's pedestal (known as
+well as its frames agree), x[c, e] the signal of hot pixels beyond that of ordinary ones (0 for these), and F the Fano
+factor of hot pixels. A pedestal moves all classes alike, so pixels of different growth determine the gain whatever the
+pedestal does. Weighted least squares: the equation is linear in a, K, K p and K F.
 
-Hot pixels fall below Poisson (F from 1 to 0.5: a generation centre emits a hole, then an electron). Half of the prior
-is that they do not, F = 1; the other half is spread evenly over 0.5 to 1: their word counts as far as ordinary pixels
-confirm it.
+Hot pixels may be sub-Poisson (F from 1 to 0.5: a generation centre emits a hole, then an electron). The prior puts half
+its weight on F = 1 and spreads the other half evenly over 0.5 to 1: hot pixels count as far as ordinary pixels confirm
+them.
 
 Reference: photon transfer, Janesick 2007; equations in docs/likelihood.md.
 """
@@ -25,10 +25,10 @@ import numpy as np
 from hsnoise.statistics.pixels.classes import Classes
 
 ROUNDS = 12
-ALIKE = (0.03, 0.1, 0.3, 1.0)  # of the variance without signal: how far classes of pixels may differ in it
-OFF_LINE, NEARER = 1.3, 0.9  # chi2 per degree of freedom from which, and share to which, it must fall
-LOOSE_DN = 1e4  # deviation of a pedestal of which nothing is known
-MOVED = 3.5  # standard errors from which a pedestal has moved, whatever its frames say
+ALIKE = (0.03, 0.1, 0.3, 1.0)  # of the variance without signal: how much classes may differ in it
+OFF_LINE, NEARER = 1.3, 0.9  # chi2 per degree of freedom that is too large, and the share to which it must then fall
+LOOSE_DN = 1e4  # standard deviation of an unknown pedestal
+MOVED = 3.5  # standard errors beyond which a pedestal has moved
 FANO = np.concatenate([[1.0], np.linspace(0.5, 1.0, 101)])
 FANO_PRIOR = np.concatenate([[0.5], np.full(101, 0.5 / 101)])
 ROUNDING = 1 / 12  # DN^2
@@ -36,7 +36,7 @@ ROUNDING = 1 / 12  # DN^2
 
 @dataclass(frozen=True)
 class Transfer:
-    """What pixel transfer finds in one channel; standard errors are widened by a chi2 above its degrees of freedom.
+    """Pixel transfer of one channel; standard errors are widened if chi2 exceeds its degrees of freedom.
 
     Attributes:
         values, covariance: gain (DN/e-), variance without signal (DN^2, pixels' mean, with rounding), and mean
@@ -45,8 +45,8 @@ class Transfer:
         hot_gain, hot_error: K F from hot pixels alone, DN/e-; NaN without any.
         fano, fano_error: Fano factor of hot pixels, NaN without any.
         chi2, dof: of the fit.
-        pedestal_dn, pedestal_error_dn [exposure]: how far pedestals moved.
-        moved [exposure]: whether by more than their frames say.
+        pedestal_dn, pedestal_error_dn [exposure]: shift of the pedestals.
+        moved [exposure]: whether they moved by more than the scatter of their frames.
         fitted_dn2 [class, exposure]: the variance that the fit expects.
     """
 
@@ -77,7 +77,7 @@ class Transfer:
 
 @dataclass(frozen=True)
 class _Places:
-    """Where a number stands among the parameters: common variance, K, K F, each class's own share, K p [exposure]."""
+    """Indices of the parameters: common variance, K, K F, each class's own share, K p [exposure]."""
 
     classes: int
     exposures: int
@@ -116,7 +116,7 @@ def pixel_transfer(classes: Classes) -> Transfer | None:
     alike, line = ALIKE[0], _line(classes, sigma, ALIKE[0])
     if line is None:
         return None
-    for wider in ALIKE[1:]:  # pixels differ in read noise, too: as far as that brings them nearer to the line
+    for wider in ALIKE[1:]:  # pixels also differ in read noise; allow as much as improves the fit
         other = _line(classes, sigma, wider)
         if line.chi2 < OFF_LINE * line.dof or other is None or other.chi2 > NEARER * line.chi2:
             break
@@ -135,9 +135,9 @@ def pixel_transfer(classes: Classes) -> Transfer | None:
 
 
 def _signals(classes: Classes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dark signal [class, exposure], of it what hot pixels have beyond ordinary ones, and their extra offset [class].
+    """Dark signal [class, exposure], the part that hot pixels have beyond ordinary ones, their extra offset [class].
 
-    DN; the signal of the shortest exposure is what the growth says. Offsets of hot pixels may be charge.
+    DN; the signal of the shortest exposure is extrapolated from the growth. Offsets of hot pixels may be charge.
     """
     weight = classes.pixels * ~classes.hot
     t = classes.exposure_s
@@ -237,7 +237,7 @@ def _told(classes: Classes, line: _Line, moved: np.ndarray) -> Transfer:
 
 
 def _with_fano(values, covariance, pair, pair_covariance):
-    """Values and covariance given that F lies in 0.5 to 1, averaged over F; and F with its deviation.
+    """Values and covariance averaged over F in 0.5 to 1, and F with its standard deviation.
 
     pair, pair_covariance: K from ordinary pixels and K F from hot ones.
     """

@@ -25,27 +25,7 @@ from hsnoise.model import NoiseModel
 # Added to the probability of each bin: bounds the influence of a pixel that the model excludes (a cosmic hit), and
 # the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.
 FLOOR = 1e-10
-LEAST_ROW_SIGMA = 1e-6  # the integral over the gains of rows that have none
-
-
-class Physics(eqx.Module):
-    """Parameters of the paper's model: gain [channel] DN/e-, dark current e-/s, read noise e-, row gain, black DN.
-
-    outliers [exposure]: fraction of pixels that follow no such law (hot pixels, cosmic hits) and may hold any count;
-    None for none. It keeps them from bending the estimates of all the others.
-    black_clamp [channel]: DN that the camera subtracts for each second of exposure; None for none.
-    white_share: white part of the variance of a rolling shutter's row gain; None for none.
-    """
-
-    gain: jax.Array
-    dark_current: jax.Array
-    read_noise: jax.Array
-    row_sigma: jax.Array | None
-    exponent: jax.Array
-    black_level: jax.Array
-    outliers: jax.Array | None = None
-    black_clamp: jax.Array | None = None
-    white_share: jax.Array | None = None
+LEAST_ROW_SIGMA = 1e-6  # rows without a gain of their own are integrated over this; a fit may end at exactly 0
 
 
 class Block(eqx.Module):
@@ -80,71 +60,86 @@ class RowRule(eqx.Module):
 
 
 Rules = tuple[RowRule, ...]
-WITH_LIKELIHOOD = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc", "black_clamp")
 
 
-def physics_of(model: NoiseModel) -> Physics:
-    """The base parameters of a model in float64. Raises ValueError for effects without a likelihood."""
-    extra = [effect.name for effect in model.effects if effect.name not in WITH_LIKELIHOOD]
-    if extra:
-        raise ValueError(f"log_likelihood: effects {extra} do not state how they change the likelihood")
-    n = len(model.channels)
+def likelihood_part(model: NoiseModel) -> NoiseModel:
+    """The effects of a model that the likelihood knows, in float64 (enabled here).
 
-    def f64(x):
-        return jnp.asarray(x, jnp.float64)
-
-    row_gain = model["row_gain"] if "row_gain" in model else None
-    return Physics(
-        gain=f64(model["gain"].value),
-        dark_current=f64(model["dark_current"].rate) if "dark_current" in model else f64(0.0),
-        read_noise=f64(model["read_noise"].sigma),
-        row_sigma=None if row_gain is None else jnp.maximum(f64(row_gain.sigma), LEAST_ROW_SIGMA),
-        exponent=f64(0.0) if row_gain is None else f64(row_gain.exponent),
-        black_level=f64(model["black_level"].value) if "black_level" in model else jnp.zeros(n, jnp.float64),
-        black_clamp=f64(model["black_clamp"].rate) if "black_clamp" in model else None,
-        white_share=None if row_gain is None else f64(row_gain.white_share),
-    )
+    Its own exposure is 0: those of the summary count, and captures of other exposures share programs.
+    """
+    with jax.enable_x64(True):
+        known = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), [e for e in model if e.in_likelihood])
+        return NoiseModel(known, cfa=model.cfa, shutter=model.shutter, exposure_s=0.0)
 
 
-def evaluate(physics: Physics, summary: Summary, rules: Rules) -> jax.Array:
-    """Log-likelihood in float64 (enabled by the caller)."""
+def dark_current(model: NoiseModel):
+    """Dark current of a model, e-/s; 0 if it has none."""
+    return model["dark_current"].rate if "dark_current" in model else 0.0
+
+
+def row_sigma(model: NoiseModel) -> jax.Array | None:
+    """Standard deviation of the row gain [channel], at least LEAST_ROW_SIGMA; None for a model without."""
+    return jnp.maximum(model["row_gain"].sigma, LEAST_ROW_SIGMA) if "row_gain" in model else None
+
+
+def black_level(model: NoiseModel):
+    """Black level of a model [channel], DN; 0 if it has none."""
+    return model["black_level"].value if "black_level" in model else np.zeros(len(model.channels))
+
+
+def black_level_at(model: NoiseModel, exposure_s):
+    """Where counts without electrons lie, DN: [channel] at a scalar exposure_s, [level, channel] at [level]."""
+    black = black_level(model)
+    clamp = model["black_clamp"].rate if "black_clamp" in model else 0 * black
+    if jnp.ndim(exposure_s) == 0:
+        return black - clamp * exposure_s
+    return black[None, :] - clamp[None, :] * exposure_s[:, None]
+
+
+def evaluate(model: NoiseModel, summary: Summary, rules: Rules, outliers: jax.Array | None = None) -> jax.Array:
+    """Log-likelihood in float64 (enabled by the caller) of a `likelihood_part`.
+
+    outliers [exposure]: fraction of pixels that follow no such model (hot pixels, cosmic hits) and may hold any count;
+    None for none. It keeps them from bending the estimates of all the others.
+    """
     total = jnp.zeros((), jnp.float64)
     if summary.histograms:
-        laws = dark_laws(jax.lax.stop_gradient(physics), summary.exposure_s)
+        laws = dark_laws(jax.lax.stop_gradient(model), summary.exposure_s)
         for rule in rules:
-            total += rows_log_likelihood(physics, rule, laws, summary)
+            total += rows_log_likelihood(model, outliers, rule, laws, summary)
     if summary.flats is not None:
-        total += flat_log_likelihood(flat_law(physics, summary.flats), summary.flats)
+        total += flat_log_likelihood(flat_law(model, summary.flats), summary.flats)
     return total
 
 
-def dark_laws(physics: Physics, exposure_s):
+def dark_laws(model: NoiseModel, exposure_s):
     """Law of the electrons of each exposure: shared by all channels, gains and black levels."""
-    mean_e = physics.dark_current * jnp.asarray(exposure_s)
-    return jax.vmap(poisson_normal_law, (0, None))(mean_e, physics.read_noise)
+    mean_e = dark_current(model) * jnp.asarray(exposure_s)
+    return jax.vmap(poisson_normal_law, (0, None))(mean_e, model["read_noise"].sigma)
 
 
-def rows_log_likelihood(physics: Physics, rule: RowRule, laws, summary: Summary) -> jax.Array:
+def rows_log_likelihood(model: NoiseModel, outliers, rule: RowRule, laws, summary: Summary) -> jax.Array:
     """Log-likelihood of the rows of a rule's channels in all exposures."""
 
-    def part(physics, inputs):
-        at, blocks, layout, scale = inputs
-        if physics.row_sigma is None:
-            return (blocks[0].counts[0, 0] * log_probability(physics, at, jnp.ones(1))[0]).sum()
-        sigma = physics.row_sigma[at.channel]
+    def part(moved, inputs):
+        (model, outliers), (at, blocks, layout, scale) = moved, inputs
+        if "row_gain" not in model:
+            return (blocks[0].counts[0, 0] * log_probability(model, outliers, at, jnp.ones(1))[0]).sum()
+        row_gain, sigma = model["row_gain"], row_sigma(model)[at.channel]
         curves = []
         for block in blocks:
             nodes = rows.make_nodes(block.low, block.high, scale, sigma, block.nodes, block.open_below)
-            table = log_probability(physics, at, nodes.beta.ravel()).reshape(*nodes.beta.shape, -1)
+            table = log_probability(model, outliers, at, nodes.beta.ravel()).reshape(*nodes.beta.shape, -1)
             curves.append((_curves(block.counts, table), nodes))
         of_rows = rows.Curves(tuple(curves), layout)
         if summary.shutter == "global":
             return rows.log_evidence_white(of_rows, sigma**2)
-        spectrum = rows.row_spectrum(physics.exponent, summary.shape[0], rule.row_stride, physics.white_share)
+        spectrum = rows.row_spectrum(row_gain.exponent, summary.shape[0], rule.row_stride, row_gain.white_share)
         return rows.log_evidence_coloured(of_rows, sigma**2 * spectrum).sum()
 
     at = binning(summary, laws, rule.channel, rule.exposure, rule.edges_dn, rule.outlier_law)
-    return _sum_with_gradient(part, physics, jax.tree.map(jnp.asarray, (at, rule.blocks, rule.layout, rule.scale)))
+    inputs = jax.tree.map(jnp.asarray, (at, rule.blocks, rule.layout, rule.scale))
+    return _sum_with_gradient(part, (model, outliers), inputs)
 
 
 @jax.custom_vjp
@@ -188,63 +183,55 @@ def binning(summary: Summary, laws, channel, exposure, edges_dn, outlier_law) ->
     return Binning(channel, exposure, jnp.asarray(summary.exposure_s)[exposure], law, edges_dn, outlier_law)
 
 
-def _sum_with_gradient(function, physics: Physics, inputs):
-    """Sum of function(physics, inputs[i]) over the parts i, one at a time.
+def _sum_with_gradient(function, moved, inputs):
+    """Sum of function(moved, inputs[i]) over the parts i, one at a time.
 
     Its gradient is made together with its value, part by part, so that memory and compilation are those of one part.
     The price: only first derivatives, in reverse mode (those of coloured rows would be wrong beyond).
     """
 
     @jax.custom_vjp
-    def total(physics, inputs):
-        return jax.lax.map(lambda x: function(physics, x), inputs).sum()
+    def total(moved, inputs):
+        return jax.lax.map(lambda x: function(moved, x), inputs).sum()
 
-    def forward(physics, inputs):
-        values, gradients = jax.lax.map(lambda x: jax.value_and_grad(function)(physics, x), inputs)
+    def forward(moved, inputs):
+        values, gradients = jax.lax.map(lambda x: jax.value_and_grad(function)(moved, x), inputs)
         return values.sum(), jax.tree.map(lambda g: g.sum(0), gradients)
 
     def backward(gradient, cotangent):
         return jax.tree.map(lambda g: cotangent * g, gradient), None
 
     total.defvjp(forward, backward)
-    return total(physics, inputs)
+    return total(moved, inputs)
 
 
-def log_probability(physics: Physics, at: Binning, beta):
-    """log P(bin | beta) of one part: [node, bin] for beta [node]."""
-    scale = physics.gain[at.channel] * jnp.maximum(beta, 1e-6)
-    black = black_level_at(physics, at.exposure_s)[at.channel]
+def log_probability(model: NoiseModel, outliers, at: Binning, beta):
+    """log P(bin | beta) of one part: [node, bin] for beta [node]; outliers as in `evaluate`."""
+    scale = model["gain"].value[at.channel] * jnp.maximum(beta, 1e-6)
+    black = black_level_at(model, at.exposure_s)[at.channel]
     edges_e = (at.edges_dn - black)[None, :] / scale[:, None]
-    mean_e = physics.dark_current * at.exposure_s
-    table = jnp.log(bin_probability(*distribution(0, edges_e, mean_e, physics.read_noise, at.law)) + FLOOR)
-    if physics.outliers is None:
+    mean_e = dark_current(model) * at.exposure_s
+    table = jnp.log(bin_probability(*distribution(0, edges_e, mean_e, model["read_noise"].sigma, at.law)) + FLOOR)
+    if outliers is None:
         return table
-    share = physics.outliers[at.exposure]
+    share = outliers[at.exposure]
     return jnp.logaddexp(table + jnp.log1p(-share), jnp.log(share * at.outlier_law + FLOOR)[None, :])
 
 
-def black_level_at(physics: Physics, exposure_s):
-    """Where counts without electrons lie, DN: [channel] at a scalar exposure_s, [level, channel] at [level]."""
-    clamp = 0.0 * physics.gain if physics.black_clamp is None else physics.black_clamp
-    if jnp.ndim(exposure_s) == 0:
-        return physics.black_level - clamp * exposure_s
-    return physics.black_level[None, :] - clamp[None, :] * exposure_s[:, None]
-
-
-def flat_law(physics: Physics, flats: FlatMoments) -> FlatLaw:
+def flat_law(model: NoiseModel, flats: FlatMoments) -> FlatLaw:
     """What the moments of flats stand on."""
+    gain = model["gain"].value
     return FlatLaw(
-        gain=physics.gain,
-        black_dn=black_level_at(physics, flats.exposure_s),
-        dark_e=physics.dark_current * jnp.asarray(flats.exposure_s),
-        read_noise_e=physics.read_noise,
-        row_variance=0.0 * physics.gain if physics.row_sigma is None else physics.row_sigma**2,
+        gain=gain,
+        black_dn=black_level_at(model, flats.exposure_s),
+        dark_e=dark_current(model) * jnp.asarray(flats.exposure_s),
+        read_noise_e=model["read_noise"].sigma,
+        row_variance=row_sigma(model) ** 2 if "row_gain" in model else 0.0 * gain,
     )
 
 
-def flat_gain_of(physics: Physics, flats: FlatMoments) -> FlatGain:
-    """Gain of the flats alone, above black and noise of the darks where they were measured, else of `physics`."""
+def flat_gain_of(model: NoiseModel, flats: FlatMoments) -> FlatGain:
+    """Gain of the flats alone, above black and noise of the darks where they were measured, else of `model`."""
     with jax.enable_x64(True):
-        law = flat_law(jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), physics), flats)
-        black_dn, variance_dn2 = (np.asarray(x) for x in without_light(law, flats))
+        black_dn, variance_dn2 = (np.asarray(x) for x in without_light(flat_law(likelihood_part(model), flats), flats))
     return flat_gain(flats, black_dn, variance_dn2, np.nan_to_num(flats.dark_error_dn2))

@@ -7,12 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hsnoise._core.threads import in_threads
-from hsnoise.criticism.gaussian import Gaussian, shrunk
-from hsnoise.frames.stack import FrameStack
-from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import black_level_of, draw_capture, floored_variance
-from hsnoise.statistics.structure import Structure, structure
+from hsnoise.simulation.gaussian import Gaussian, floored_variance, shrunk
 
 
 @dataclass(frozen=True)
@@ -34,13 +29,19 @@ class Reference:
     deviation: np.ndarray
     floor: np.ndarray
 
+    @staticmethod
+    def of(names: tuple[str, ...], groups: tuple[str, ...], draws: np.ndarray, error: np.ndarray) -> Reference:
+        """The reference of draws [draw, statistic] whose analytic error is `error` [statistic]."""
+        deviation = _deviation(draws.var(0, ddof=1), len(draws) - 1, error**2)
+        return Reference(names, groups, draws, draws.mean(0), deviation, error**2)
+
     def z(self, values: np.ndarray) -> np.ndarray:
         """(values - mean) / deviation, the error of the mean included."""
         return (values - self.mean) / (self.deviation * np.sqrt(1 + 1 / len(self.draws)))
 
     @cached_property
-    def law(self) -> Gaussian:
-        """Law of z of the model's own draws, all parameters held."""
+    def distribution(self) -> Gaussian:
+        """Distribution of z of the model's own draws, all parameters held."""
         return shrunk(self.own_z(), np.zeros((1, len(self.mean))))
 
     def own_z(self) -> np.ndarray:
@@ -53,23 +54,11 @@ class Reference:
         return (self.draws - others) / (deviation * np.sqrt(1 + 1 / (n - 1)))
 
 
-def measure(stack: FrameStack, model: NoiseModel) -> Structure:
-    """Statistics of a stack, counts taken above the black level of `model`."""
-    return structure(stack, black_level_of(model))
-
-
-def reference(model: NoiseModel, like: FrameStack, draws: int, seed: int, tick=lambda: None) -> Reference:
-    """Statistics of `draws` captures drawn from `model` as `like` was taken."""
-    drawn = in_threads(lambda i: measure(draw_capture(seed + i, model, like), model), range(draws), tick)
-    values = np.stack([one.values for one in drawn])
-    floor = np.median([one.error for one in drawn], axis=0) ** 2
-    deviation = _deviation(values.var(0, ddof=1), draws - 1, floor)
-    return Reference(drawn[0].names, drawn[0].groups, values, values.mean(0), deviation, floor)
-
-
 def _deviation(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
-    """Deviation of statistics. Half of the analytic variance stays however many draws there are: of a rare event that
-    no draw has, one in a capture is still no wonder.
+    """Deviation of statistics.
+
+    Half of the analytic variance stays however many draws there are: a rare event that no draw shows is no surprise
+    in one capture.
     """
     return np.sqrt(np.maximum(floored_variance(variance, dof, floor), floor / 2))
 

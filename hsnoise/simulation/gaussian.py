@@ -1,4 +1,4 @@
-"""Normal laws of many statistics estimated from few draws."""
+"""Normal distributions of many statistics, estimated from few draws."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 HARDLY_VARIES = 0.25  # variance of z over draws
+LEAST_SHRINKAGE = 0.05  # of a covariance toward its diagonal
+JITTER = 0.02  # variance added to each z, so that no combination of statistics has none
+FLOOR_DRAWS = 6.0  # the analytic error counts as this many draws
+FAR_OFF = 5.0  # deviations from which a statistic counts less
 
 
 @dataclass(frozen=True)
@@ -17,16 +21,12 @@ class Gaussian:
     mean: np.ndarray
     covariance: np.ndarray
 
-    def factor(self) -> tuple[np.ndarray, bool]:
-        return scipy.linalg.cholesky(self.covariance, lower=True), True
-
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log density, up to the constant that all share, of z [..., statistic]."""
-        factor = self.factor()
+        factor = np.linalg.cholesky(self.covariance)  # unlike SciPy's, it lets other threads work
         residual = np.atleast_2d(z) - self.mean
-        square = (residual * scipy.linalg.cho_solve(factor, residual.T).T).sum(-1)
-        log_determinant = 2 * np.log(np.diagonal(factor[0])).sum()
-        out = -0.5 * (square + log_determinant)
+        white = scipy.linalg.solve_triangular(factor, residual.T, lower=True, check_finite=False)
+        out = -0.5 * (white**2).sum(0) - np.log(np.diagonal(factor)).sum()
         return out if np.ndim(z) > 1 else out[0]
 
     def standardised(self, z: np.ndarray) -> np.ndarray:
@@ -46,10 +46,15 @@ class Gaussian:
 
 
 def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
-    """Law of statistics whose own draws are z [draw, statistic], base parameters unknown along `slopes`.
+    """Distribution of statistics whose draws are z [draw, statistic], base parameters unknown along `slopes`."""
+    return Gaussian(np.zeros(z.shape[1]), shrunk_covariance(z) + slopes.T @ slopes)
 
-    The covariance is shrunk to its diagonal as far as the draws are too few to tell (Ledoit and Wolf, "A
-    well-conditioned estimator for large-dimensional covariance matrices", J. Multivariate Anal. 88, 2004).
+
+def shrunk_covariance(z: np.ndarray) -> np.ndarray:
+    """Covariance [statistic, statistic] of draws z [draw, statistic], shrunk toward its diagonal.
+
+    As far as the draws are too few to know it (Ledoit and Wolf, "A well-conditioned estimator for large-dimensional
+    covariance matrices", J. Multivariate Anal. 88, 2004), LEAST_SHRINKAGE at least.
     """
     n, d = z.shape
     centred = z - z.mean(0)
@@ -61,6 +66,15 @@ def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
     distance = ((sample - target) ** 2).sum()
     squares = (centred**2).T @ (centred**2) / n - sample**2
     np.fill_diagonal(squares, 0.0)
-    share = float(np.clip(squares.sum() / n / max(distance, 1e-30), 0.05, 1.0))
-    covariance = (1 - share) * sample + share * target + 0.02 * np.eye(d) + slopes.T @ slopes
-    return Gaussian(np.zeros(d), covariance)
+    share = float(np.clip(squares.sum() / n / max(distance, 1e-30), LEAST_SHRINKAGE, 1.0))
+    return (1 - share) * sample + share * target + JITTER * np.eye(d)
+
+
+def share_of_far(z: np.ndarray) -> np.ndarray:
+    """Square roots of Huber's weights of deviations z: what is far off counts less."""
+    return np.sqrt(np.minimum(1.0, FAR_OFF / np.maximum(np.abs(z), 1e-12)))
+
+
+def floored_variance(variance: np.ndarray, dof: int, floor: np.ndarray) -> np.ndarray:
+    """Variance of statistics over draws, `dof` degrees of freedom, kept from vanishing by an analytic one, `floor`."""
+    return (dof * variance + FLOOR_DRAWS * floor) / (dof + FLOOR_DRAWS)

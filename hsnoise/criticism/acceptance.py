@@ -1,0 +1,59 @@
+"""Whether a step of `improve` is kept: it must fit better, on frames that no fit has seen too, and be beyond chance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.criticism import rules
+from hsnoise.criticism.outcomes import Refusal, Refused
+from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.story import Step
+from hsnoise.effects import AbstractEffect
+from hsnoise.fitting.result import FitResult
+
+
+def why_worse(step: Step, before: Step) -> Refusal | None:
+    """In which way statistics, or frames that no fit has seen, fit worse with what was added; None if they do not."""
+    # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
+    unseen = not (np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params))
+    after, until_now = step.comparison, before.comparison
+    errors = until_now.error, after.error
+    if not step.fit.converged and after.error * rules.GROWTH > until_now.error and not until_now.fits:
+        return Refusal(Refused.NOT_CONVERGED, *errors)
+    allowed = rules.WORSE
+    if after.error > until_now.error:
+        # The worst group may be that of another effect, which is still missing and does not stand quite still.
+        less = sum(after.groups.values()) < rules.TOTAL_FALLS * sum(until_now.groups.values())
+        if not less or after.error > rules.GROWTH * until_now.error:
+            return Refusal(Refused.STATISTICS_WORSE, *errors)
+        allowed = 0.0
+    if unseen and step.held_out - before.held_out <= allowed:
+        return Refusal(Refused.HELD_OUT_WORSE, before.held_out, step.held_out)
+    return None
+
+
+def is_there(effect: AbstractEffect, result: FitResult) -> bool:
+    """Whether some amplitude of the effect is beyond chance in a fit with it; one that fits hold, whether it is set.
+
+    Of an effect that marks none, numbers that may be 0 and have no upper bound count, or else those of either sign, or
+    shares.
+    """
+    found = effect.parameters(result.params.channels)
+    kinds = (
+        [p for p in found if p.spec.amplitude],
+        [p for p in found if p.spec.low == 0 and p.spec.high is None],
+        [p for p in found if p.spec.low is None],
+        [p for p in found if p.spec.low == 0],
+    )
+    amplitudes = next((some for some in kinds if some), [])
+    fitted = [p.spec.from_absent(*result.table[p.name][:2]) for p in amplitudes if p.name in result.names]
+    if not fitted:
+        return not amplitudes or any(p.spec.from_absent(p.value)[0] != 0 for p in amplitudes)
+    return any(abs(off) > rules.THERE_SIGMA * error for off, error in fitted)
+
+
+def is_too_little(nearest: tuple[Candidate, ...], steps: list[Step]) -> bool:
+    """Whether a further effect is too weak, beside those that were chosen from the same frames, where all fits."""
+    last = steps[-1]
+    late = rules.evidence(len(last.diagnosis.ranking), rules.LATER_RATE)
+    return len(steps) > 1 and last.comparison.fits and nearest[0].score < late

@@ -1,0 +1,91 @@
+"""What `diagnose` and `improve` come to, by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from hsnoise.effects import AbstractEffect
+
+
+class Verdict(StrEnum):
+    """What `diagnose` says of a model."""
+
+    NOTHING_MISSING = "nothing missing"
+    NAMED = "named"
+    AMBIGUOUS = "ambiguous"  # several names, and the capture that would decide
+    UNEXPLAINED = "unexplained"  # by any effect of the library
+
+
+class Ended(StrEnum):
+    """Why `improve` ended."""
+
+    FINISHED = "finished"  # nothing significant is left
+    WEAK_LEFT = "weak left"  # no effect stands out, but the error is above what chance gives
+    AS_CHANCE = "as chance"  # nothing more could be added, and the error is what chance gives
+    NOT_HELD = "not held"  # an effect is named, but no refit with it held
+    UNEXPLAINED = "unexplained"  # by any effect of the library
+    MINUTES = "minutes over"
+    STEPS = "steps over"
+    UNFINISHED = "unfinished"  # the story so far
+
+
+class Refused(StrEnum):
+    """Why a candidate was left out."""
+
+    NOT_FITTED = "not fitted"
+    NOT_CONVERGED = "not converged"  # and the error hardly fell
+    STATISTICS_WORSE = "statistics worse"
+    HELD_OUT_WORSE = "held-out frames worse"
+    ZERO = "compatible with zero"
+    NO_CHANGE = "no change by itself"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a candidate was left out, with the error before and after, or the held-out log-likelihood, nats."""
+
+    why: Refused
+    before: float = math.nan
+    after: float = math.nan
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a story ended.
+
+    Attributes:
+        why: by name.
+        limit: minutes or additions after which it stopped; NaN without.
+        following: the effect that would be next, and its score, nats; None without.
+        refused: what was tried last and left out.
+    """
+
+    why: Ended
+    limit: float = math.nan
+    following: tuple[str, float] | None = None
+    refused: Mapping[str, Refusal] = field(default_factory=dict)
+
+
+class Side(StrEnum):
+    """Where an offset arises: in electrons, before the gain, or in DN, after it."""
+
+    BEFORE = "before the gain"
+    AFTER = "after the gain"
+
+
+def has_sides(effect: AbstractEffect) -> bool:
+    """Whether an effect may arise on either side of the gain."""
+    return hasattr(effect, "after_gain")
+
+
+def side_of(effect: AbstractEffect) -> Side:
+    """The side of an effect; before the gain for one that has no choice."""
+    return Side.AFTER if getattr(effect, "after_gain", False) else Side.BEFORE
+
+
+def on_side(effect: AbstractEffect, side: Side) -> AbstractEffect:
+    """An effect that may arise on either side, on this one."""
+    return replace(effect, **{"after_gain": side == Side.AFTER})

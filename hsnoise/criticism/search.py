@@ -1,0 +1,143 @@
+"""The candidates, looked at ever more closely: a glance at all, many draws of those that lead, pairs of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hsnoise.criticism import rules
+from hsnoise.criticism.candidates import given
+from hsnoise.criticism.fingerprint import Bench
+from hsnoise.criticism.outcomes import Side, has_sides, on_side
+from hsnoise.criticism.ranking import (
+    CLOSE,
+    LEADERS,
+    Evidence,
+    Judged,
+    Pair,
+    best_pairs,
+    closest,
+    judge,
+    judge_all,
+)
+from hsnoise.criticism.refine import refined, refined_pair, with_base
+from hsnoise.effects import AbstractEffect, Maker
+
+GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
+AMPLITUDES, DETAILS = (0.35, 1.0, 2.5), 4  # and those that are likely, the user's own at once;
+LIKELY, MOST_LIKELY, LEAST_LIKELY = 0.25, 10, 3  # share of the best score, and how many of them
+WEAK, STRONG = 0.7, 1.4  # amplitudes from which draws at the lower or the higher one are needed, too
+MOST_PAIRS = 2  # that are refined, two effects at once
+NEAR = 0.8  # share of the best score that makes a candidate a leader
+MANY_DETAILS = 16  # of which the leaders' best are taken
+AROUND, CLOSE_DETAILS = (1.0,), 12  # amplitude, relative, at which the leaders are drawn again
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the candidates are drawn on and judged by; makers: of the built-in ones and of a user's `own`, by name."""
+
+    bench: Bench
+    evidence: Evidence
+    makers: dict[str, Maker]
+    own: dict[str, Maker]
+
+    def glance(self) -> list[Judged]:
+        """All candidates, judged by a few draws, the user's own by many; best first.
+
+        Raises ValueError for one of the user's that changes nothing.
+        """
+        prints = self.bench.fingerprints({name: (maker, AMPLITUDES) for name, maker in self.own.items()}, DETAILS)
+        for one in prints:
+            if not one.shifts.any():
+                drawn = one.shifts[..., 0].size
+                raise ValueError(f"candidates: {one.name} changed no count of {drawn} captures that were drawn")
+        prints += self.bench.fingerprints(
+            {name: (maker, GLANCE) for name, maker in self.makers.items()}, GLANCE_DETAILS
+        )
+        return judge_all(prints, self.evidence)
+
+    def likely(self, judged: list[Judged]) -> list[Judged]:
+        """Candidates, the likely ones judged by more draws, and whoever comes first then; best first."""
+        enough = LIKELY * judged[0].score
+        some = [one for i, one in enumerate(judged[:MOST_LIKELY]) if i < LEAST_LIKELY or one.score > enough]
+        return self.first_known(self.with_more_draws(some, judged))
+
+    def partners(self, judged: list[Judged]) -> list[Judged]:
+        """Candidates, those that may be one of two effects judged by more draws; best first."""
+        names = {name for pair in best_pairs(judged, self.evidence, MOST_LIKELY) for name in pair.names}
+        return self.first_known(self.with_more_draws([one for one in judged if one.of.name in names], judged))
+
+    def first_known(self, judged: list[Judged]) -> list[Judged]:
+        """Candidates, the first of them not by a glance alone."""
+        while judged[0].of.amplitudes == GLANCE:
+            judged = self.with_more_draws(judged[:1], judged)
+        return judged
+
+    def with_more_draws(self, some: Iterable[Judged], judged: list[Judged]) -> list[Judged]:
+        """Candidates, those of `some` that were only glanced at judged by draws at the amplitudes around theirs."""
+        wanted = {}
+        for one in some:
+            if one.of.amplitudes == GLANCE:
+                low = AMPLITUDES[:1] if one.amplitude < WEAK else ()
+                high = AMPLITUDES[2:] if one.amplitude > STRONG or not low else ()
+                wanted[one.of.name] = (one.of.maker, (*low, *GLANCE, *high))
+        again = {one.of.name: one for one in judge_all(self.bench.fingerprints(wanted, DETAILS), self.evidence)}
+        return _best_first(again.get(one.of.name, one) for one in judged)
+
+    def closer(self, judged: list[Judged]) -> list[Judged]:
+        """The leaders with parameters closer to the capture: fingerprints bend, and strong effects show it."""
+        leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
+        wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
+        prints = self.bench.fingerprints(wanted, MANY_DETAILS)
+        varied = [judge(of, self.evidence, np.array(of.amplitudes)) for of in prints]
+        again = [self.drawn_close(one.candidate(self.evidence).effect) for one in varied]
+        # Not against the leaders as they were: in few draws, rare counts seem to scatter less than they do.
+        better = [max(pair, key=lambda one: one.score) for pair in zip(varied, again, strict=True)]
+        return _best_first([*better, *judged[len(leaders) :]])
+
+    def drawn_close(self, effect: AbstractEffect) -> Judged:
+        """An effect with parameters brought closer to the capture, judged by many draws there."""
+        maker = given(*refined([effect], self.bench, self.evidence))
+        (of,) = self.bench.fingerprints({effect.name: (maker, AROUND)}, CLOSE_DETAILS)
+        return judge(of, self.evidence, CLOSE)
+
+    def on_its_side(self, judged: list[Judged]) -> tuple[list[Judged], AbstractEffect | None]:
+        """The first candidate before or after the gain, where it describes the capture better, the base fitted to it.
+
+        Random details confound the side of the gain, and the base fit has already absorbed part of the effect. The
+        estimate with another base is the better one, too.
+        """
+        first = judged[0]
+        effect = first.candidate(self.evidence).effect
+        if first.score <= self.evidence.least or not has_sides(effect):
+            return judged, None
+        sides = [on_side(effect, side) for side in Side]
+        found = [(*with_base(one, self.bench, self.evidence), one) for one in sides]
+        _, estimate, start = max(found, key=lambda one: one[0])
+        closer = self.drawn_close(start)
+        # Scores of many draws are lower: in few, rare counts seem to scatter less. Far lower, the search went astray.
+        if closer.score <= NEAR * first.score:
+            return judged, None
+        again = _best_first([closer, *judged[1:]])
+        return again, estimate if again[0] is closer else None
+
+    def best_pair(self, judged: list[Judged]) -> Pair | None:
+        """Two effects that explain the capture together: of those that come nearest, refined one after the other."""
+        makers, refined_ones = {**self.makers, **self.own}, []
+        for pair in best_pairs(judged, self.evidence, MOST_PAIRS):
+            if pair.score > judged[0].score + self.evidence.least:
+                # Details that were chosen for one alone made up for the other: chosen again.
+                prints = self.bench.fingerprints({name: (makers[name], GLANCE) for name in pair.names}, MANY_DETAILS)
+                shifts = zip(prints, pair.shifts[::-1], strict=True)
+                start = [closest(of, self.evidence, other) for of, other in shifts]
+                refined_ones.append(refined_pair(pair, start, self.bench, self.evidence))
+                if refined_ones[-1].misfit < rules.MISFIT_LEFT:
+                    break
+        return max(refined_ones, key=lambda one: one.score, default=None)
+
+
+def _best_first(judged: Iterable[Judged]) -> list[Judged]:
+    return sorted(judged, key=lambda one: -one.score)

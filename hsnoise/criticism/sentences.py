@@ -1,0 +1,272 @@
+"""What `compare`, `diagnose` and `improve` found, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from hsnoise._core.types import unit_in_words
+from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused, Verdict, has_sides
+from hsnoise.effects import AbstractEffect
+from hsnoise.fitting.result import number, rounded
+
+LEGEND = (
+    "score: log-likelihood ratio of this effect alone against nothing missing (what resembles the missing one scores,"
+    " too: the first is meant); z left: how far off the worst group of statistics is with it in the model, in"
+    " deviations of a normal distribution (below 3.5 is chance); p: chance of such a score if nothing is missing"
+)
+ENDED_IN_SHORT = {
+    Ended.FINISHED: "Nothing significant is left",
+    Ended.WEAK_LEFT: "No effect stands out, but something weak may be left",
+    Ended.AS_CHANCE: "Nothing more could be added, and the error is as chance gives",
+    Ended.NOT_HELD: "Still {headline}, but no refit with it held",
+    Ended.UNEXPLAINED: "Something is left that no effect of the library explains",
+    Ended.MINUTES: "It stopped after {limit}; something may be left",
+    Ended.STEPS: "It stopped after {limit}; something may be left",
+    Ended.UNFINISHED: "Not finished",
+}
+UNITS = {Ended.MINUTES: "minute", Ended.STEPS: "addition"}  # of a limit
+REFUSED = {
+    Refused.NOT_FITTED: "could not be fitted",
+    Refused.NOT_CONVERGED: "no fit with it converged, and the error hardly fell ({went})",
+    Refused.STATISTICS_WORSE: "statistics fit worse with it (error {went})",
+    Refused.HELD_OUT_WORSE: "held-out frames fit worse with it, by {less:.1f} nats",
+    Refused.ZERO: "came out compatible with zero",
+    Refused.NO_CHANGE: "changed nothing by itself",
+}
+
+
+# Comparisons
+
+
+def describes(error: float) -> str:
+    """That a model fits."""
+    return f"The model describes these frames: error {number(error)}, where 1.0 is as close as its own samples."
+
+
+def fails(error: float, worst: str, is_close: bool) -> str:
+    """That a model does not fit, and in which group of statistics."""
+    how = "comes close to these frames, but fails" if is_close else "does not describe these frames,"
+    close = "1.0 would be as close as its own samples"
+    return f"The model {how} most of all in {worst}: error {number(error)}, {close}."
+
+
+def measure(error: float, misfit: float, own: float) -> str:
+    """What the error is: a misfit over the model's own."""
+    return (
+        f"error {error:.2f} (1.0: like the model's own samples): the worst misfit below, {misfit:.2f}, over that of the"
+        f" model's own samples, {own:.2f}"
+    )
+
+
+def columns_compared(first: int, last: int, columns: int) -> str:
+    """What of large frames was looked at."""
+    return f"only columns {first} to {last} of {columns} were compared: the frames are large"
+
+
+def off(name: str, measured: float, model: float, z: float) -> str:
+    """A statistic that the model fails to give."""
+    return f"{name}: measured {measured:.3g}, the model gives {model:.3g} ({_deviations(z)})"
+
+
+def brought_nearer(name: str, measured: float, model: float, z: float, now: float) -> str:
+    """A statistic that another model gives better; model, now: what the one before and this one give."""
+    return f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with it {now:.3g}"
+
+
+def _deviations(z: float) -> str:
+    return f"{abs(z):.0f} standard deviations {'above' if z > 0 else 'below'}"
+
+
+# Diagnoses
+
+
+def headline(verdict: Verdict, names: Sequence[str]) -> str:
+    """A verdict in a few words: "missing: row_noise and hot_pixels"."""
+    if not names:
+        return str(verdict)
+    return f"missing: {(' or ' if verdict == Verdict.AMBIGUOUS else ' and ').join(names)}"
+
+
+def judgement(verdict: Verdict, names: Sequence[str]) -> str:
+    """A verdict as a sentence."""
+    if verdict == Verdict.NOTHING_MISSING:
+        return "Nothing significant is missing."
+    if verdict == Verdict.UNEXPLAINED:
+        return "Something is left that no effect of the library explains."
+    return f"{_capital(headline(verdict, names))}."
+
+
+def first_estimate(effect: AbstractEffect) -> str:
+    """What an effect is, and the first estimate of its parameters."""
+    values = []
+    for field, spec in effect.specs().items():
+        value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
+        values.append(f"{field} {value} {unit_in_words(spec.unit)}".rstrip())
+    values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
+    return f"{effect.name}: {effect.about()} First estimate (a fit gives it with its error): {', '.join(values)}."
+
+
+def open_side(effect: AbstractEffect) -> str:
+    """That the side of the gain is a guess; empty for an effect that has but one."""
+    if not has_sides(effect):
+        return ""
+    return (
+        f"whether {effect.name} arises before or after the gain is a first guess: improve fits both and keeps the"
+        " likelier"
+    )
+
+
+def come_nearest(names: Iterable[str]) -> str:
+    """The effects that explain most of what none explains."""
+    return (
+        f"most statistics would be explained, though none of them whole, by (improve tries these): {', '.join(names)}"
+    )
+
+
+def next_call(of_users: bool) -> str:
+    """How to go on from a diagnosis; of_users: whether the effect is one of the user's own."""
+    loop = "hsnoise.improve(stack, candidates=[...]), or " if of_users else "hsnoise improve, or in Python "
+    return f"next: {loop}hsnoise.fit(stack, model=fit.params.add(found.best.effect))"
+
+
+def still_off(names: Iterable[str], group: str, misfit: float, statistics: Iterable[str]) -> str:
+    """What is off with these effects in the model."""
+    return (
+        f"still off with {' and '.join(names)} at the first estimate (the worst group, {group}, by {misfit:.1f}"
+        f" deviations; a refit may leave less): {'; '.join(statistics)}"
+    )
+
+
+def partly_explained(names: Iterable[str], blamed: str, left: str) -> str:
+    """Advice where effects explain a part; blamed, left: the worst groups of statistics without and with them."""
+    beside = "what is left of them" if left == blamed else f"the {left} statistics that are left"
+    by = f"{' and '.join(names)} would explain part of the {blamed} statistics"
+    return f"{by}; no effect in the library explains {beside}"
+
+
+def not_explained(blamed: str) -> str:
+    """Advice where no effect comes near."""
+    return f"none of the effects in the library explains the {blamed} statistics, and none comes near"
+
+
+def more_frames(names: Sequence[str]) -> str:
+    """Advice where two effects look alike."""
+    return f"more frames would tell {names[0]} from {names[1]}"
+
+
+# Stories
+
+
+def errors_so_far(errors: Sequence[float]) -> str:
+    """What became of the error until now; empty before the first."""
+    ends = dict.fromkeys(number(errors[i]) for i in (0, -1)) if errors else ()
+    return f"error {' -> '.join(ends)}" if ends else ""
+
+
+def refusal(of: Refusal) -> str:
+    """Why a candidate was left out."""
+    went = f"{number(of.before)} -> {number(of.after)}"
+    return REFUSED[of.why].format(went=went, less=of.before - of.after)
+
+
+def ended_in_short(ending: Ending, missing: str) -> str:
+    """How a story ended, without a full stop; missing: what the last diagnosis named."""
+    unit = f"{UNITS.get(ending.why, '')}{'' if ending.limit == 1 else 's'}"
+    return ENDED_IN_SHORT[ending.why].format(headline=missing, limit=f"{ending.limit:g} {unit}")
+
+
+def ended(ending: Ending, error: float, missing: str, advice: str) -> str:
+    """How a story ended, whole: with the error of the last model, what would be next, and what was tried."""
+    short, of_error = ended_in_short(ending, missing), f"(error {error:.2f})"
+    match ending.why:
+        case Ended.UNFINISHED:
+            said = f"{short}: whether something is missing was being looked for."
+        case Ended.MINUTES | Ended.STEPS:
+            said = f"{short}."
+        case Ended.WEAK_LEFT:
+            said = f"{short}: the error is {error:.2f}."
+        case Ended.AS_CHANCE:
+            said = f"Nothing more could be added, and the error is {error:.2f}, as chance gives."
+        case Ended.UNEXPLAINED:
+            said = f"{short} {of_error}: {advice}." if advice else f"{short} {of_error}."
+        case _:
+            said = f"{short} {of_error}{_following(ending)}."
+    tried = "; ".join(f"{name} {refusal(why)}" for name, why in ending.refused.items())
+    return f"{said} What was tried is left out: {tried}." if tried else said
+
+
+def _following(ending: Ending) -> str:
+    if ending.following is None:
+        return ""
+    name, score = ending.following
+    return f": {name} would be next, by {score:.0f} nats, as chance gives among so many"
+
+
+def added_in_short(names: Iterable[str], first: float, last: float) -> str:
+    """What was added, and what became of the error."""
+    how = "fell" if last < first else "went"
+    return f"Added {', '.join(names)}, and the error {how} from {number(first)} to {number(last)}."
+
+
+def sizes(rows: Mapping[str, tuple[float, float, str]], effect: AbstractEffect, sides_open: bool) -> tuple[str, ...]:
+    """What was fitted of an effect, its rows of a table, and what was chosen; whether its side of the gain is open."""
+    said = []
+    for label, (value, error, unit) in rows.items():
+        size, of = rounded(value, error)
+        of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
+        said.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip() + ".")
+    chosen = effect.settings().items()
+    said += [f"{effect.name}.{field}: {value}." for field, value in chosen if value is not None]
+    if sides_open:
+        said.append(
+            f"{effect.name} fits as well on the other side of the gain: these frames do not tell which it is on."
+        )
+    return tuple(said)
+
+
+def moved(name: str, old: tuple[float, float], new: tuple[float, float], unit: str) -> str:
+    """A parameter that changed; old, new: value and standard error."""
+    return f"{name} moved from {rounded(*old)[0]} to {rounded(*new)[0]} {unit_in_words(unit)}".rstrip() + "."
+
+
+def fell_together(before: float, after: float) -> str:
+    """What fell where the error did not; before, after: misfits of all groups together."""
+    return f", misfit of all groups together {number(before)} -> {number(after)}"
+
+
+def because(nearer: Sequence[str], score: float, is_nearest: bool) -> str:
+    """Why an effect was added: the statistics that it brought nearer, or else its score, nats.
+
+    is_nearest: whether no effect explains all that was off.
+    """
+    reason = nearer[0] if nearer else f"its fingerprint is in the statistics (score {score:.0f} nats)"
+    return f"{reason} (no effect explains all that is off; this one comes nearest)" if is_nearest else reason
+
+
+def added(step: int, name: str, reason: str, before: float, after: float, fell: str) -> str:
+    """Why a step was taken, and what became of the error; fell: what fell beside it."""
+    return f"Step {step}: added {name}, because {reason}; error {before:.2f} -> {after:.2f}{fell}."
+
+
+def with_care(outcome: str) -> str:
+    """What to mind of a fit that did not converge."""
+    return f"Read its numbers with care, the last fit has {outcome}."
+
+
+def frames_apart(fitted: Sequence[int], held_out: Sequence[int]) -> str:
+    """Which frames were fitted and which held out; fitted, held_out: dark frames of each exposure."""
+    return (
+        f"Fitted and compared were the first {_span(fitted)} dark frames of each exposure; held-out: the log-likelihood"
+        f" of the statistics of the other {_span(held_out)}, in nats (one more: 2.7 times as probable). To fit all of"
+        " them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
+    )
+
+
+def _span(numbers: Sequence[int]) -> str:
+    return f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"
+
+
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"

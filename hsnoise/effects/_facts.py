@@ -1,0 +1,94 @@
+"""What is known of a capture when effects are proposed for it: what amplitudes and details are measured by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from hsnoise.effects._base import AbstractEffect
+
+Maker = Callable[[float, np.random.Generator], "AbstractEffect"]
+
+LEAST_ELECTRONS = 0.2  # of a signal, below which nothing that acts on it shows
+
+
+@dataclass(frozen=True)
+class Places:
+    """What comes closest to the dark frames, whether or not there is any of it.
+
+    shading: axis, start, above and length of a `BlackShading`. glow: row and column of an `AmplifierGlow`.
+    second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1.
+    """
+
+    shading: tuple[str, str, bool, float]
+    glow: tuple[float, float]
+    second_chain: int
+
+
+@dataclass(frozen=True)
+class CaptureFacts:
+    """What a capture, and the model that was fitted to it, say about what may be missing.
+
+    Attributes:
+        effects: names of those in the model.
+        cfa: "mono" or a 2x2 Bayer string; shutter: "rolling" or "global".
+        read_noise_e: its rms, e-.
+        dark_e_per_s: mean dark current, e-/s.
+        gain: DN/e- [channel].
+        frames: most frames of a dark exposure.
+        longest_s: longest dark exposure, s; at least 1e-9, so that it divides.
+        has_exposure: whether that is more than 0.
+        has_bias: whether an exposure is short enough to tell what happens while a frame waits to be read.
+        exposures_differ: whether the darks have more than one exposure.
+        levels: numbers of signal levels: exposures of the darks, and flats.
+        light_e: mean photoelectrons of a pixel in the brightest flat; 0 without flats.
+        line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
+        places: where static patterns lie.
+        code_step: distance of the codes, DN; None if all occur.
+    """
+
+    effects: tuple[str, ...]
+    cfa: str
+    shutter: str
+    read_noise_e: float
+    dark_e_per_s: float
+    gain: np.ndarray
+    frames: int
+    longest_s: float
+    has_exposure: bool
+    has_bias: bool
+    exposures_differ: bool
+    levels: int
+    light_e: float
+    line: tuple[str, float]
+    places: Places
+    code_step: float | None
+
+    @property
+    def dark_e(self) -> float:
+        """Mean dark electrons of a pixel in the longest exposure."""
+        return self.dark_e_per_s * self.longest_s
+
+    @property
+    def signal_e(self) -> float:
+        """Mean electrons of a pixel, of light or of the dark current, in the exposure that has most."""
+        return max(self.dark_e, self.light_e)
+
+    @property
+    def shows_dark_current(self) -> bool:
+        """Whether enough dark electrons are collected for what acts on them to show."""
+        return self.dark_e > LEAST_ELECTRONS
+
+    @property
+    def shows_signal(self) -> bool:
+        """Whether enough electrons are collected for what acts on them to show."""
+        return self.signal_e > LEAST_ELECTRONS
+
+
+def either_side(rng: np.random.Generator) -> bool:
+    """Whether an offset arises after the gain: a detail that nobody knows."""
+    return bool(rng.integers(2))

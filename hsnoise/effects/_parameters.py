@@ -1,0 +1,102 @@
+"""The physical parameters of an effect: how they are declared, and what is known about each."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterSpec:
+    """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning, whether held.
+
+    amplitude: whether it says how strong the effect is; absent: the value at which there is none of it.
+    """
+
+    unit: str
+    low: float | None
+    high: float | None
+    per_channel: bool
+    doc: str
+    held: bool | Literal["at bounds"]
+    amplitude: bool = False
+    absent: float = 0.0
+
+    def holds(self, value: float) -> bool:
+        """Whether a fit leaves a parameter of this value where it is."""
+        return value in (self.low, self.high) if self.held == "at bounds" else self.held
+
+    def from_absent(self, value: float, error: float = 0.0) -> tuple[float, float]:
+        """How far a value is from absent, and the standard error of that; 1/value where infinity is absent."""
+        if math.isinf(self.absent):
+            return 1 / value, error / value**2
+        return value - self.absent, error
+
+    def scaled(self, value: np.ndarray, factor: float) -> np.ndarray:
+        """The value `factor` times as far from absent, as far as the bounds allow."""
+        grown = value / factor if math.isinf(self.absent) else self.absent + (value - self.absent) * factor
+        return np.clip(grown, -np.inf if self.low is None else self.low, np.inf if self.high is None else self.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One number of a model: name in tables, `<effect>.<parameter>[.<channel>]`, value and declaration."""
+
+    name: str
+    value: float
+    spec: ParameterSpec
+
+
+def _as_leaf(x):
+    # An array keeps its own precision: a fit hands over float64 whatever the session uses.
+    if eqx.is_inexact_array(x) and isinstance(x, jax.Array):
+        return x
+    try:
+        return jnp.asarray(x, float)
+    except (TypeError, ValueError):
+        return x  # no number: `__check_init__`, which knows the parameter's name, says so
+
+
+def param(
+    unit: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    per_channel: bool = False,
+    default: float | None = None,
+    doc: str = "",
+    held: bool | Literal["at bounds"] = False,
+    amplitude: bool = False,
+    absent: float = 0.0,
+) -> Any:
+    """Declare a physical parameter of an effect: a scalar, or one value per channel [channel].
+
+    Args:
+        unit: its unit, "1" if it has none.
+        low, high: inclusive bounds; None for unbounded.
+        per_channel: one value per colour channel; a scalar given instead holds for all channels.
+        default: value unless one is given; None: one must be given.
+        doc: its meaning in a few words.
+        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly. "at bounds": only
+            if it lies at one, such as a place at the edge of the frame.
+        amplitude: whether it says how strong the effect is. With all its amplitudes at `absent` an effect does nothing;
+            `diagnose` scales them, and `improve` keeps an effect only if one of them is far enough from there.
+        absent: the value of an amplitude at which there is none of the effect: 0, 1 for a factor, or infinity, which
+            the parameter need not be able to take.
+    """
+    spec = ParameterSpec(unit, low, high, per_channel, doc, held, amplitude, absent)
+    metadata = {"parameter": spec}
+    if default is None:
+        return eqx.field(converter=_as_leaf, metadata=metadata)
+    return eqx.field(converter=_as_leaf, metadata=metadata, default=default)
+
+
+def shortest(value: np.ndarray | np.floating) -> float:
+    """The number of fewest digits that reads back as `value` in its precision: 0.1, not 0.10000000149."""
+    return float(str(value))

@@ -1,0 +1,159 @@
+"""What a refit by simulation moves, and what it looks at: coordinates of all numbers, score and structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise.fitting.gradients import gradient_at
+from hsnoise.fitting.result import FitResult
+from hsnoise.frames.stack import FrameStack
+from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
+from hsnoise.likelihood.parameters import Parameters, parameters_of
+from hsnoise.likelihood.plan import plan_rules, replan
+from hsnoise.likelihood.summary import coding_of, summarise, without_counts
+from hsnoise.model import NoiseModel
+from hsnoise.simulation.draws import black_level_of
+from hsnoise.simulation.portion import Portion
+from hsnoise.statistics.structure import Structure, structure
+
+PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
+MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
+LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
+MARGIN = 1.15
+UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
+SCORE_ERROR = 0.3  # at least, of the score in whitened units, whose deviation is 1 where the base fit is right
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained).
+
+    given: the model that was handed over; its base parameters are another place to start.
+    """
+
+    portion: Portion
+    base: FitResult
+    model: NoiseModel
+    extra: tuple[str, ...]
+    given: NoiseModel
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """Those of the base fit, without shares of outliers: its likelihood gives the score."""
+        with jax.enable_x64(True):
+            return coordinates_for(self.base.summary, self.base.params)
+
+    @cached_property
+    def added(self) -> Parameters:
+        """The numbers of the effects that the base fit lacks."""
+        return parameters_of(self.model, self.extra)
+
+    @cached_property
+    def centre(self) -> np.ndarray:
+        with jax.enable_x64(True):
+            return np.asarray(self.coordinates.start())
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """What a change of each base coordinate is measured by: as much as doubles the parameter, say."""
+        with jax.enable_x64(True):
+            return self.coordinates.sizes(self.centre)
+
+    @cached_property
+    def spread(self) -> tuple[np.ndarray, np.ndarray]:
+        """Variances and directions of the covariance of the base coordinates over their sizes."""
+        slope = np.maximum(np.abs(self.slope(self.centre)), 1e-12) * self.sizes
+        covariance, unknown = self._base_covariance()
+        covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+        covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
+        covariance = covariance / slope[:, None] / slope[None, :]
+        # Beside a deviation of millions, one of thousandths would have no digits.
+        share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
+        return np.linalg.eigh(covariance * share[:, None] * share[None, :])
+
+    def _base_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance of the base fit in the order of the coordinates, and which of these it did not fit."""
+        names, fitted = self.coordinates.names, self.base.names
+        covariance = np.diag(np.full(len(names), np.inf))
+        here = [i for i, name in enumerate(names) if name in fitted]
+        there = [fitted.index(names[i]) for i in here]
+        covariance[np.ix_(here, here)] = self.base.covariance[np.ix_(there, there)]
+        return covariance, ~np.isfinite(np.diagonal(covariance))
+
+    @cached_property
+    def whiten(self) -> np.ndarray:
+        """Square root of the covariance of the base coordinates, directions without information cut to MOST_SPREAD."""
+        values, vectors = self.spread
+        return self.sizes[:, None] * vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
+
+    @cached_property
+    def prior(self) -> np.ndarray:
+        """Inverse variances that keep numbers near the start: of effects, and where the base fit knew nothing."""
+        base = np.where(self.spread[0] < MOST_SPREAD, 1e-6, 1.0)
+        return np.concatenate([base, np.full(len(self.added.numbers), PRIOR_SIGMA**-2)])
+
+    def slope(self, vector: np.ndarray) -> np.ndarray:
+        """d parameter / d coordinate of the base."""
+        with jax.enable_x64(True):
+            return np.asarray(self.coordinates.slope(jnp.asarray(vector)))
+
+    @cached_property
+    def coding(self):
+        return coding_of(self.portion.frames)
+
+    @cached_property
+    def rules(self):
+        return plan_rules(self.coordinates.base, summarise(self.portion.frames, coding=self.coding), MARGIN)
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        return np.concatenate([np.zeros(len(self.centre)), self.added.read(self.model)])
+
+    @cached_property
+    def other_start(self) -> np.ndarray | None:
+        """Where the base parameters are those of `given`, which may know more of the effects than `base` did."""
+        vector = self.coordinates.read(self.given)
+        if not np.all(np.isfinite(vector)) or np.allclose(vector, self.centre, rtol=1e-6):
+            return None
+        return np.concatenate([np.linalg.solve(self.whiten, vector - self.centre), self.start[len(vector) :]])
+
+    def base_vector(self, y: np.ndarray) -> np.ndarray:
+        """The coordinates of the base."""
+        n = len(self.centre)
+        return self.centre + self.whiten @ y[:n]
+
+    def at(self, y: np.ndarray) -> NoiseModel:
+        """The model whose numbers are y."""
+        return self.added.put(self.coordinates.put(self.model, self.base_vector(y)), y[len(self.centre) :])
+
+    def in_float64(self, y: np.ndarray) -> NoiseModel:
+        with jax.enable_x64(True):
+            return self.at(y)
+
+    def statistics(self, frames: FrameStack) -> Structure:
+        """Score of the base likelihood in whitened units, and the structure of the frames."""
+        found = structure(frames, black_level_of(self.base.params))
+        summary = summarise(frames, coding=self.coding)
+        with jax.enable_x64(True):
+            rules = replan(self.rules, plan_rules(self.coordinates.base, summary, MARGIN))
+            _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
+            score = self.whiten.T @ np.asarray(gradient)
+        return replace(
+            found,
+            names=(*(f"score: direction {i}" for i in range(len(score))), *found.names),
+            groups=(*["score"] * len(score), *found.groups),
+            values=np.concatenate([score, found.values]),
+            error=np.concatenate([np.full(len(score), SCORE_ERROR), found.error]),
+        )
+
+    def share_of(self, step: np.ndarray) -> float:
+        """How much of a step may be made at once: statistics are straight lines of the parameters only nearby."""
+        n = len(self.centre)
+        base, own = np.abs(self.whiten @ step[:n]) / self.sizes, np.abs(step[n:])
+        longest = max(base.max() / LONGEST_OF_BASE, own.max(initial=0.0) / LONGEST_STEP)
+        return min(1.0, 1 / max(longest, 1e-12))

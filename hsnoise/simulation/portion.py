@@ -1,0 +1,92 @@
+"""The one cut of a capture: what of it is held in memory, and drawn again and again."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hsnoise.frames.arguments import check_no_copies
+from hsnoise.frames.joining import replaced
+from hsnoise.frames.stack import FrameStack
+from hsnoise.statistics.structure import check_size
+
+MOST_PIXELS = 4_000_000
+LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
+BOTH = ("dark", "flat")
+
+
+@dataclass(frozen=True, eq=False)
+class Portion:
+    """Frames of a capture, checked, cut and loaded once.
+
+    Attributes:
+        frames: the exposures that are used, in memory, with their place on the sensor.
+        left_out: sentences on what is not in it.
+    """
+
+    frames: FrameStack
+    left_out: tuple[str, ...]
+
+    @staticmethod
+    def of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> Portion:
+        """The exposures of some kinds, cut to MOST_PIXELS.
+
+        Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
+        darks, for frames that are copies, and for frames too small to tell rows from pixels.
+        """
+        check_size(stack)
+        if "dark" not in stack.kind:
+            raise ValueError("stack: expected dark frames, got flats only")
+        chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
+        rows, columns = stack.shape
+        per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(chosen) * rows * columns))
+        frames = sum(min(stack.n_frames[i], per_exposure) for i in chosen)
+        kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
+        first = 0
+        if kept < columns:
+            first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
+        end = min(first + kept, columns)
+        part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
+        counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
+        check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
+        # What depends on the place stays where it is on the sensor.
+        window = part.window or ((0, first, rows, columns) if end - first < columns else None)
+        left_out = []
+        if end - first < columns:
+            left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
+        if frames < sum(stack.n_frames[i] for i in chosen):
+            left_out.append(f"only the first {per_exposure} frames of each exposure were compared: large capture")
+        return Portion(part.with_counts(counts, window), tuple(left_out))
+
+    @cached_property
+    def darks(self) -> Portion:
+        """Its dark exposures."""
+        dark = [i for i, kind in enumerate(self.frames.kind) if kind == "dark"]
+        if len(dark) == self.frames.n_exposures:
+            return self
+        return Portion(self.frames.select(exposures=dark), self.left_out)
+
+
+def middle_of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> FrameStack:
+    """The middle of a few frames of each exposure, nothing read: enough for a look at how pixels differ.
+
+    Raises ValueError where there is no exposure of these kinds.
+    """
+    chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
+    if not chosen:
+        raise ValueError(f"stack: expected {' or '.join(kinds)} frames, and there are none")
+    frames, rows, columns = MIDDLE
+    # What depends on the place stays where it is on the sensor.
+    whole = replaced(stack, window=stack.window or (0, 0, *stack.shape))
+    spans = [_middle(size, most) for size, most in zip(stack.shape, (rows, columns), strict=True)]
+    return whole.select(frames=slice(0, frames), exposures=chosen, rows=spans[0], columns=spans[1])
+
+
+def _middle(size: int, most: int) -> slice:
+    """At most `most` of a side, even at both ends."""
+    first = max((size - most) // 4 * 2, 0)
+    return slice(first, min(first + most, size))
