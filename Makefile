@@ -18,11 +18,13 @@ ARGS ?=
 demo: $(VENV)/.installed
 	$(BIN)/hsnoise demo $(if $(DATA),--data "$(DATA)") $(ARGS)
 
+# Most of the time is compilation; `make test-slow` compiles as users do.
+test: export XLA_FLAGS ?= --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not gpu and not browser and not benchmark" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not gpu and not browser and not benchmark" $(ARGS)
 
 test-browser: $(VENV)/.installed-browser
 	$(BIN)/python -m pytest -m browser -rs tests/test_report_browser.py $(ARGS)

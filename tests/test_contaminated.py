@@ -187,7 +187,12 @@ ROWS = [
     ("two identical frames", identical_frames, None, rf"identical.*\b1\b.*\b{ODD}\b|\b1\b.*\b{ODD}\b.*identical"),
     ("a masterdark among darks", masterdark, None, FRAME),
 ]
-IDS = [f"{name}, {100 * share:g} %" if share else name for name, _, share, _ in ROWS]
+MARKED = [  # of three shares, the one in the middle is slow
+    pytest.param(
+        *row, id=f"{row[0]}, {100 * row[2]:g} %" if row[2] else row[0], marks=[pytest.mark.slow] * (row[2] == SHARES[1])
+    )
+    for row in ROWS
+]
 SENSORS = ["differ", pytest.param("alike", marks=pytest.mark.slow)]
 
 
@@ -213,7 +218,7 @@ def test_a_clean_capture_is_fitted_and_trusted(pixels, cfa):
 
 
 @pytest.mark.parametrize("pixels", SENSORS)
-@pytest.mark.parametrize(("name", "contaminate", "share", "words"), ROWS, ids=IDS)
+@pytest.mark.parametrize(("name", "contaminate", "share", "words"), MARKED)
 def test_a_contaminated_capture_is_fitted_right_or_named(pixels, name, contaminate, share, words):
     contaminated = capture(pixels, "RGGB" if name == "dead colour channel" else "mono")
     contaminate(contaminated, share, np.random.default_rng(6))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -24,6 +25,7 @@ from hsnoise.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NOTEBOOK = ROOT / "docs" / "first-hour.ipynb"
 BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE, WORDS = {"python", "sh", "console"}, {"text"}
 # Long work in little: added to the command, the last of an option counts.
@@ -33,10 +35,14 @@ IN_LITTLE = {
     "train": ["--steps", "2", "--preset", "smoke"],
     "evaluate": ["--no-rivals", "--crop", "32"],
 }
+FEW = ("row_noise", "column_fixed_pattern", "photo_response_nonuniformity")  # candidates of a diagnosis
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
-    """Language and content of each block of a page."""
+    """Language and content of each block of a page; of a notebook each cell of code."""
+    if page == NOTEBOOK:
+        cells = json.loads(page.read_text())["cells"]
+        return [("python", "".join(cell["source"])) for cell in cells if cell["cell_type"] == "code"]
     return BLOCK.findall(page.read_text())
 
 
@@ -57,13 +63,25 @@ def without_numbers(text: str) -> list[str]:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
+def small_example(monkeypatch) -> None:
+    """A quarter of the pixels of the capture that comes with hsnoise: pages draw hundreds of such captures."""
+    whole = hsnoise.examples.st8
+
+    def middle(folder):
+        night = whole(folder)
+        for path in night.rglob("*.fits.fz"):
+            with fits.open(path) as file:
+                counts, header = file[1].data[60:180, 80:240], file[1].header
+            fits.CompImageHDU(counts, header).writeto(path, overwrite=True)
+        return night
+
+    monkeypatch.setattr(hsnoise.examples, "st8", middle)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, small_example) -> Path:
     """A fresh folder with what a reader has: frames of a camera, a picture, videos."""
     night = hsnoise.examples.st8(tmp_path / "night")
-    for path in night.rglob("*.fits.fz"):  # a quarter of the pixels: pages draw hundreds of such captures
-        with fits.open(path) as file:
-            middle, header = file[1].data[60:180, 80:240], file[1].header
-        fits.CompImageHDU(middle, header).writeto(path, overwrite=True)
     for name in ("dark3s", "dark25s", "flat3s"):
         of = tmp_path / ("flats" if name == "flat3s" else "darks")
         of.mkdir(exist_ok=True)
@@ -141,8 +159,8 @@ def test_every_block_says_what_it_is(page):
             assert not re.match(r"(\$ )?(hsnoise|pip|make|python|import|from) ", block), block
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if CODE & {kind for kind, _ in blocks(page)}], ids=name_of)
-def test_page_runs(page, folder, monkeypatch, capsys):
+@pytest.mark.parametrize("page", [p for p in (*PAGES, NOTEBOOK) if CODE & {kind for kind, _ in blocks(p)}], ids=name_of)
+def test_page_runs(page, folder, few_candidates, monkeypatch, capsys):
     reader = Reader(page, monkeypatch, capsys)
     for language, block in blocks(page):
         reader.run(language, block)
@@ -165,7 +183,11 @@ def _enhancer(page) -> None:
     assert page.enhanced.shape == (48, 64, 3) and np.isfinite(page.enhanced).all()
 
 
-CHECKS = {"add-an-effect": _own_effect, "sampling": _sampling, "enhancer": _enhancer}
+def _first_hour(page) -> None:
+    assert page.after.error < page.report.error / 10
+
+
+CHECKS = {"add-an-effect": _own_effect, "sampling": _sampling, "enhancer": _enhancer, "first-hour": _first_hour}
 
 
 def test_pytorch_takes_the_draws_without_a_copy():

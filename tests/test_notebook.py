@@ -9,10 +9,12 @@ import sys
 from pathlib import Path
 
 import nbformat
+import pytest
 
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow  # tests/test_docs.py runs its cells on smaller frames
 def test_the_notebook_runs_from_top_to_bottom(tmp_path):
     """In a process of its own, as a user's; it writes its frames into the fresh folder."""
     notebook = ROOT / "docs" / "first-hour.ipynb"

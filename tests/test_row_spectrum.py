@@ -44,6 +44,7 @@ def with_share(model, white_share):
 # Nearly white rows
 
 
+@pytest.mark.slow
 def test_white_rows_of_a_rolling_shutter_are_fitted_with_honest_errors():
     """A strong row gain of few rows: with a DC term in the draws alone, the gain's root mean square pull is 6."""
     model = camera(0.0, sigma=0.4)
@@ -118,7 +119,10 @@ def test_the_fitted_spectrum_is_plotted_with_its_white_share(mixture):
     assert ends[0] > ends[1]  # a power law alone falls on
 
 
-@pytest.mark.parametrize(("exponent", "white_share"), [(1.0, 0.0), (0.0, 0.0), (1.0, 1.0)])
+@pytest.mark.parametrize(
+    ("exponent", "white_share"),
+    [(1.0, 0.0), pytest.param(0.0, 0.0, marks=pytest.mark.slow), pytest.param(1.0, 1.0, marks=pytest.mark.slow)],
+)
 def test_a_free_share_at_its_bounds_has_an_honest_error(exponent, white_share):
     """Rows without any, of an exponent of 0 too, where only the mean of a frame tells, and rows that are all white."""
     model = camera(exponent, white_share)

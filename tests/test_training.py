@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,16 +29,30 @@ from hsnoise.enhance.weights import load_network, save_network
 TINY = Preset(6, 2, 3, 8, 3, Recipe(maps=2, kernels=(3,)))
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
     """A folder of five tiny clips, and a preset of their size."""
-    monkeypatch.setitem(train.PRESETS, "smoke", TINY)
-    clips = tmp_path / "clips"
-    clips.mkdir()
+    clips = tmp_path_factory.mktemp("clips")
     rng = np.random.default_rng(0)
     for name in "abcde":
         np.savez(clips / f"{name}.npz", frames=rng.integers(0, 256, (4, 12, 14, 3), dtype=np.uint8))
-    return clips
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(train.PRESETS, "smoke", TINY)
+        yield clips
+
+
+@pytest.fixture(scope="module")
+def whole(folder, tmp_path_factory) -> Path:
+    """A run that has ended."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    run_train(arguments(folder, run))
+    return run
+
+
+@pytest.fixture
+def ended(whole, tmp_path) -> Path:
+    """A copy of it, for a test that writes into it."""
+    return shutil.copytree(whole, tmp_path / "run")
 
 
 def arguments(folder, out, *more):
@@ -47,8 +63,7 @@ def leaves(path):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(load_network(path)[0])]
 
 
-def test_an_interrupted_run_ends_with_the_same_weights(folder, tmp_path, monkeypatch):
-    run_train(arguments(folder, tmp_path / "whole"))
+def test_an_interrupted_run_ends_with_the_same_weights(folder, whole, tmp_path, monkeypatch):
     step, monkeypatch_s = Trainer.step, 0.0
     monkeypatch.setattr(train, "CHECKPOINT_S", monkeypatch_s)
 
@@ -65,35 +80,31 @@ def test_an_interrupted_run_ends_with_the_same_weights(folder, tmp_path, monkeyp
     newest = checkpoints.checkpoints(tmp_path / "cut")[0]
     newest.write_bytes(newest.read_bytes()[:-100])
     run_train(arguments(folder, tmp_path / "cut"))
-    for one, other in zip(
-        leaves(tmp_path / "whole" / train.ENDED), leaves(tmp_path / "cut" / train.ENDED), strict=True
-    ):
+    for one, other in zip(leaves(whole / train.ENDED), leaves(tmp_path / "cut" / train.ENDED), strict=True):
         np.testing.assert_array_equal(one, other)
-    logs = [(tmp_path / run / "log.csv").read_text() for run in ("whole", "cut")]
+    logs = [(run / "log.csv").read_text() for run in (whole, tmp_path / "cut")]
     assert logs[0] == logs[1] and logs[0].count("\n") == 3
     assert len(checkpoints.checkpoints(tmp_path / "cut")) == 2
     assert (tmp_path / "cut" / "validation-00000006.png").stat().st_size > 100
 
 
-def test_a_full_disk_is_told_and_the_last_checkpoint_stays(folder, tmp_path, monkeypatch, capsys):
-    run_train(arguments(folder, tmp_path / "run"))
-    kept = [path.read_bytes() for path in checkpoints.checkpoints(tmp_path / "run")]
+def test_a_full_disk_is_told_and_the_last_checkpoint_stays(ended, monkeypatch):
+    kept = [path.read_bytes() for path in checkpoints.checkpoints(ended)]
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("hsnoise.enhance.training.checkpoints.write_arrays", full)
     with pytest.raises(OSError, match="the last one is intact"):
-        checkpoints.write(tmp_path / "run", 7, {}, {})
-    assert [path.read_bytes() for path in checkpoints.checkpoints(tmp_path / "run")] == kept
+        checkpoints.write(ended, 7, {}, {})
+    assert [path.read_bytes() for path in checkpoints.checkpoints(ended)] == kept
 
 
-def test_another_run_in_the_same_folder_is_refused(folder, tmp_path, capsys):
-    run_train(arguments(folder, tmp_path / "run"))
+def test_another_run_in_the_same_folder_is_refused(folder, ended, capsys):
     with pytest.raises(SystemExit):
-        run_train(arguments(folder, tmp_path / "run", "--seed", "1"))
+        run_train(arguments(folder, ended, "--seed", "1"))
     assert "another run (seed differ" in capsys.readouterr().err
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["seed"] == 0
+    assert json.loads((ended / "run.json").read_text())["seed"] == 0
 
 
 def test_another_model_of_the_same_name_is_another_run(folder, tmp_path, capsys):
@@ -120,8 +131,7 @@ def interrupted(monkeypatch, number):
     monkeypatch.setattr(Trainer, "step", killed)
 
 
-def test_an_interrupt_keeps_the_steps_until_then(folder, tmp_path, monkeypatch, capsys):
-    run_train(arguments(folder, tmp_path / "whole"))
+def test_an_interrupt_keeps_the_steps_until_then(folder, whole, tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as patched:
         interrupted(patched, 4)
         with pytest.raises(SystemExit):
@@ -130,9 +140,7 @@ def test_an_interrupt_keeps_the_steps_until_then(folder, tmp_path, monkeypatch, 
     assert "the same command resumes here" in capsys.readouterr().out
     run_train(arguments(folder, tmp_path / "run"))
     assert "Resuming from step 4" in capsys.readouterr().out
-    for one, other in zip(
-        leaves(tmp_path / "whole" / train.ENDED), leaves(tmp_path / "run" / train.ENDED), strict=True
-    ):
+    for one, other in zip(leaves(whole / train.ENDED), leaves(tmp_path / "run" / train.ENDED), strict=True):
         np.testing.assert_array_equal(one, other)
     run_train(arguments(folder, tmp_path / "run"))
     assert "Already finished" in capsys.readouterr().out
@@ -260,9 +268,8 @@ def test_rivals_make_noisy_frames_better():
         assert after < 0.2 * before, name
 
 
-def test_an_evaluation_is_written(folder, tmp_path, capsys):
-    run_train(arguments(folder, tmp_path / "run"))
-    weights = tmp_path / "run" / train.ENDED
+def test_an_evaluation_is_written(folder, whole, tmp_path, capsys):
+    weights = whole / train.ENDED
     run_evaluate([str(weights), "--clips", str(folder), "--crop", "8", "--no-rivals", "--out", str(tmp_path / "found")])
     text = (tmp_path / "found" / "evaluation.md").read_text()
     assert "scaled input" in text and "hsnoise ST-LSTM" in text and "| d |" in text
@@ -274,16 +281,16 @@ def test_an_evaluation_is_written(folder, tmp_path, capsys):
     assert "not a file of weights" in capsys.readouterr().err
 
 
-def test_clips_that_were_trained_on_are_not_scored(folder, tmp_path, capsys):
-    run_train(arguments(folder, tmp_path / "run"))
-    net, about = load_network(tmp_path / "run" / train.ENDED)
+def test_clips_that_were_trained_on_are_not_scored(folder, whole, tmp_path, capsys):
+    net, about = load_network(whole / train.ENDED)
     save_network(tmp_path / "other.eqx", net, {**about, "clips": [*about["clips"], *about["held_out"]]})
     with pytest.raises(SystemExit):
         run_evaluate([str(tmp_path / "other.eqx"), "--clips", str(folder), "--crop", "8", "--no-rivals"])
     assert "was trained on them" in capsys.readouterr().err
-    (folder / "a.npz").rename(folder / "d2.npz")  # the fourth by name now
+    renamed = shutil.copytree(folder, tmp_path / "clips")
+    (renamed / "a.npz").rename(renamed / "d2.npz")  # the fourth by name now
     with pytest.raises(SystemExit):
-        run_evaluate([str(tmp_path / "run" / train.ENDED), "--clips", str(folder), "--crop", "8", "--no-rivals"])
+        run_evaluate([str(whole / train.ENDED), "--clips", str(renamed), "--crop", "8", "--no-rivals"])
     assert "d2 would be scored" in capsys.readouterr().err
 
 
