@@ -60,8 +60,8 @@ def planes_by_colour(letters: tuple[str, ...]) -> tuple[tuple[str, list[int]], .
 class Sheet:
     """The statistics of exposures with one number of frames. `letters` [plane] is the colour of each plane.
 
-    exposures: their numbers. values, errors: [exposure], by (group, what); counts: which are numbers of rare pixels; maps: which are
-    of the shape of the static map.
+    exposures: their numbers. values, errors: [exposure], by (group, what); counts: which are numbers of rare pixels;
+    maps: which are of the shape of the static map.
     """
 
     letters: tuple[str, ...]
