@@ -24,7 +24,6 @@ from hsnoise.criticism.improve import _ending, _Work
 from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused
 from hsnoise.criticism.story import Step, Story, together
 from hsnoise.simulation.draws import draw_capture
-from hsnoise.simulation.gaussian import Gaussian, shrunk
 from hsnoise.simulation.portion import Portion
 
 MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -242,22 +241,6 @@ def test_what_a_clamp_leaves_is_told_by_its_refit():
     assert hsnoise.compare(fit.params, stack).error > 5
     assert found.verdict == "ambiguous" and found.names == ("black_clamp", "gain")
     assert found.unexplained.misfit < 3.5 and not found.unexplained.statistics
-
-
-def test_shrunk_distribution_is_that_of_its_draws():
-    rng = np.random.default_rng(3)
-    z = rng.standard_normal((4000, 6)) @ np.linalg.cholesky(0.5 * np.eye(6) + 0.5).T
-    found = shrunk(z, np.zeros((1, 6)))
-    np.testing.assert_allclose(found.covariance, 0.5 * np.eye(6) + 0.5, atol=0.12)
-    exact = Gaussian(np.zeros(6), np.eye(6))
-    assert exact.log_density(np.ones(6)) == pytest.approx(-3.0)
-    assert abs(exact.normal_scores(np.ones(6), ("a",) * 6)["a"]) < 1
-
-
-def test_large_captures_are_cut_but_keep_their_rows():
-    big = empty_stack(frames=3, shape=(1200, 1600), exposure_s=(0.1,))
-    cut = Portion.of(big).darks.frames
-    assert cut.shape[0] == 1200 and cut.shape[1] < 1600 and cut.shape[1] % 2 == 0
 
 
 @pytest.mark.parametrize(
