@@ -59,7 +59,7 @@ def test_draws_that_tell_nothing_of_correlations_leave_the_diagonal():
     np.testing.assert_allclose(shrunk_covariance(z), (1 + JITTER) * np.eye(2))
 
 
-@pytest.mark.parametrize("number", [8, 24, 64])
+@pytest.mark.parametrize("number", [16, 24, 64])
 def test_shrunk_is_closer_to_the_truth_than_draws_or_diagonal_alone(number):
     """Of many statistics, of which each goes with one other."""
     true = np.kron(np.eye(20), [[1.0, 0.8], [0.8, 1.0]])
