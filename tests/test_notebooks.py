@@ -154,7 +154,7 @@ def test_doubts_stand_above_the_table_and_notes_below_it(results):
     assert fit.conclusion.light == Light.AMBER and "Odd frames. (1 more below)" in fit.conclusion.sentence
     assert pieces.of("li") == [NASTY, NASTY]  # the doubt that the conclusion does not say already, and the note
     assert pieces.place("li") < pieces.place("table") < pieces.place("details")
-    assert NASTY in pieces.of("details")[0] and "converged; 9 iterations" in pieces.of("details")[0]
+    assert f"converged: {NASTY}; 9 iterations{NASTY}" in pieces.of("details")[0]  # how it ended, and the note
     assert pieces.of("th") == ["parameter", "value", "standard error", "unit"]
     cells = pieces.of("td")
     rows = {cells[i]: cells[i + 1 : i + 4] for i in range(0, len(cells), 4)}

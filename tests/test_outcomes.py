@@ -23,9 +23,6 @@ READING = {
 READERS = {
     "_core/parsing.py": "words of the command line",
     "cli/main.py": "errors of other libraries, put on one line",
-    "fit.py": "names of parameters",
-    "fitting/notes.py": "names of parameters",
-    "fitting/pixel_result.py": "names of parameters",
     "effects/_base.py": "docstrings, those of users' effects too",
     "enhance/training/clips.py": "names of users' files",
     "enhance/training/options.py": "words of the command line",

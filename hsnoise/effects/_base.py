@@ -5,7 +5,7 @@ An effect of one's own is a class of about 20 lines in one's own file:
     class RowOffset(AbstractEffect):
         name = "row_offset"
         stage = Stage.READ
-        sigma: Scalar = param("e-", low=0, doc="standard deviation over rows and frames")
+        sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over rows and frames")
 
         def sample(self, signal, capture, *, key):
             frames, rows, _ = signal.shape
@@ -186,7 +186,7 @@ class AbstractEffect(eqx.Module):
         least_frames: frames of one exposure that it takes to show it.
         selection_nats: what its score must make up for a detail that is read off the capture and not drawn at random.
         confounded_with: what changes darks as it does, so that only flats tell the two apart; empty if nothing does.
-        decided_by: the capture that tells them apart, in words that go on "... ".
+        decided_by: the capture that tells them apart, as a sentence of advice.
     """
 
     name: eqx.AbstractClassVar[str]

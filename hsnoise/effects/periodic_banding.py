@@ -62,7 +62,7 @@ class PeriodicBanding(AbstractEffect):
         over_rows = self.axis == "row"
         lines, colours = capture.shape[0 if over_rows else 1], len(cfa_tile(capture.cfa))
         mean = np.exp(2j * np.pi * float(self.frequency) * np.arange(0, lines, colours)).mean()
-        within = capture.offset_variance(self.amplitude**2 / 2, self.after_gain)
+        whole = capture.offset_variance(self.amplitude**2 / 2, self.after_gain)
         # As much of the sinusoid as the mean of a frame holds is no difference between its lines.
-        between = (1 - abs(mean) ** 2) * within / (1 - colours / lines)
-        return {"row_x_frame" if over_rows else "column_x_frame": between, "frame": within - between}
+        between = (1 - abs(mean) ** 2) * whole / (1 - colours / lines)
+        return {"row_x_frame" if over_rows else "column_x_frame": between, "frame": whole - between}

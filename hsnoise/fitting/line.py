@@ -341,7 +341,6 @@ def _result(estimate: _Estimate, correction: _Correction, setting: _Setting, sca
         error = _Estimate(*(np.full_like(a, np.inf) for a in value))
     most = _shot_noise_gain(correction.mean, correction.variance)[0]
     has_gain = setting.is_line & (value.gain > 1.01 * LEAST_GAIN * most)
-    has_rate = has_gain.any() & summary.exposure_s.any()
     has_black = summary.black_level_dn is not None or np.ptp(summary.exposure_s) > 0
     params = model_of(
         summary,
@@ -354,7 +353,7 @@ def _result(estimate: _Estimate, correction: _Correction, setting: _Setting, sca
     black_error = np.zeros(len(value.black_level)) if summary.black_level_dn is not None else error.black_level
     known = {
         ("gain", "value"): (has_gain, error.gain),
-        ("dark_current", "rate"): (has_rate & has_black, error.dark_current),
+        ("dark_current", "rate"): (has_gain.any() & summary.exposure_s.any() & has_black, error.dark_current),
         ("read_noise", "sigma"): (has_gain.any(), _root_error(value.read_variance, error.read_variance)),
         ("row_gain", "sigma"): (has_black, _root_error(value.row_variance, error.row_variance)),
         ("row_gain", "exponent"): (True, error.exponent),

@@ -37,11 +37,11 @@ def model_of(
     """
     exposures = summary.exposure_s if len(summary.exposure_s) else summary.flats.exposure_s
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        effects = [ShotNoise(), DarkCurrent(dark_current), ReadNoise(read_noise), Gain(gain), BlackLevel(black_level)]
-        effects += [] if row_gain is None else [RowGain(*row_gain)]
-        effects += [] if black_clamp is None else [BlackClamp(black_clamp)]
+        rows = [] if row_gain is None else [RowGain(*row_gain)]
+        clamp = [] if black_clamp is None else [BlackClamp(black_clamp)]
+        electrons = [ShotNoise(), DarkCurrent(dark_current), ReadNoise(read_noise)]
         return NoiseModel(
-            [*effects, ADC(summary.white_level_dn)],
+            [*electrons, *rows, Gain(gain), BlackLevel(black_level), *clamp, ADC(summary.white_level_dn)],
             cfa=summary.cfa,
             shutter=summary.shutter,
             exposure_s=float(np.sort(exposures)[len(exposures) // 2]),

@@ -1,23 +1,26 @@
-"""Statistics of the rows and columns of one exposure: variances, colours, scales, spectra."""
+"""Statistics of rows and columns of exposures: their variances, colours, scales, spectra."""
 
 from __future__ import annotations
 
-import numpy as np
-import scipy  # its submodules are imported on first use
+from functools import lru_cache
 
-from hsnoise.statistics._anova import Exposure
-from hsnoise.statistics._sheet import ABS_VARIANCE, Sheet, correlation, fisher, log_ratio
+import numpy as np
+import scipy  # its parts are imported when they are used
+
+from hsnoise.statistics._anova import Lines
+from hsnoise.statistics._exposures import Exposures, inner
+from hsnoise.statistics._sheet import ABS_VARIANCE, Sheet, correlation, correlations, fisher, log_ratio
 
 BANDS = 5
 HAAR_LEVELS = 6
 SAME_ROW = ((0, 1), (2, 3))
 SAME_COLUMN = ((0, 2), (1, 3))
 TINY = 1e-6
-WHITENED_FROM = 2  # lower frequencies of a periodogram carry trends, not spectral lines
+WHITENED_FROM = 2  # the lowest frequencies of a periodogram carry trends, not lines
 
 
-def variances(sheet: Sheet, x: Exposure) -> None:
-    """Log ratios of the mean squares of the analysis of variance; white noise makes all equal the residual variance."""
+def variances(sheet: Sheet, x: Exposures) -> None:
+    """Log ratios of the mean squares of the analysis of variance, each the residual variance under white noise."""
     planes, frames, rows, columns = x.shape
     dof = max(frames - 1, 1)
     row_frame = columns * _power(x.row_frame) / (dof * (rows - 1))
@@ -31,7 +34,7 @@ def variances(sheet: Sheet, x: Exposure) -> None:
         return
     row = frames * columns * _power(x.row) / (rows - 1)
     column = frames * rows * _power(x.column) / (columns - 1)
-    pixel = frames * _power(x.pixel) / ((rows - 1) * (columns - 1))
+    pixel = frames * inner(x.pixel, x.pixel) / ((rows - 1) * (columns - 1))
     sheet.add("static rows", "row / row x frame", log_ratio(row, row_frame), np.sqrt(2 / (planes * (rows - 1))))
     sheet.add("static columns", "column / pixel", log_ratio(column, x.variance), np.sqrt(2 / (planes * (columns - 1))))
     error = np.sqrt(2 / (planes * (rows - 1) * (columns - 1)))
@@ -39,176 +42,219 @@ def variances(sheet: Sheet, x: Exposure) -> None:
 
 
 def _power(x: np.ndarray) -> np.ndarray:
-    """Sum of squares of each plane."""
-    return np.square(x, dtype=np.float64).sum(tuple(range(1, x.ndim)))
+    """Sum of squares [exposure, plane] of x [exposure, plane, ...]."""
+    return np.square(x).reshape(*x.shape[:2], -1).sum(-1)
 
 
-def colours(sheet: Sheet, x: Exposure) -> None:
-    """Correlations of rows and columns between colours, and with their neighbours in space and time."""
-    planes, frames, rows, columns = x.shape
-    n_rows, n_columns = max(frames - 1, 1) * rows, max(frames - 1, 1) * columns
+@lru_cache
+def _colour_pairs(letters: tuple[str, ...]) -> list[tuple[str, list[int], list[int]]]:
+    """Name of each pair of colours, by whether they share a row, and the planes that it is of."""
     labels: dict[str, list[tuple[int, int]]] = {}
-    for i in range(planes):
+    for i in range(len(letters)):
         for j in range(i):
             where = "same row" if (j, i) in SAME_ROW else "neighbouring row"
-            labels.setdefault(f"{where} of {'-'.join(sorted((sheet.letters[j], sheet.letters[i])))}", []).append((j, i))
-    for label, pairs in labels.items():
-        values = [correlation(x.row_frame[j], x.row_frame[i], (0, 1)) for j, i in pairs]
-        sheet.add("row x frame", f"correlation, {label}", values, 1 / np.sqrt(n_rows * len(pairs)))
-    near = _next(x.row_frame, 2)
+            labels.setdefault(f"{where} of {'-'.join(sorted((letters[j], letters[i])))}", []).append((j, i))
+    return [(label, [j for j, _ in pairs], [i for _, i in pairs]) for label, pairs in labels.items()]
+
+
+def colours(sheet: Sheet, x: Exposures) -> None:
+    """Correlations of rows and columns between colours and with their neighbours in space and time."""
+    planes, frames, rows, columns = x.shape
+    n_rows, n_columns = max(frames - 1, 1) * rows, max(frames - 1, 1) * columns
+    values = correlations(x.row_frame)
+    for label, first, second in _colour_pairs(sheet.letters):
+        error = 1 / np.sqrt(n_rows * len(first))
+        sheet.add("row x frame", f"correlation, {label}", values[:, first, second], error)
+    near = _next(x.row_frame, 3)
     sheet.add_colours("row x frame", f"correlation with the {_next_line('row', planes)}", near, 1 / np.sqrt(n_rows))
-    near = _next(x.column_frame, 2)
+    near = _next(x.column_frame, 3)
     error = 1 / np.sqrt(n_columns * planes)
     sheet.add("column x frame", f"correlation with the {_next_line('column', planes)}", near, error)
     if planes == 4:
-        values = [correlation(x.column_frame[j], x.column_frame[i], (0, 1)) for j, i in SAME_COLUMN]
-        sheet.add("column x frame", "correlation, same column", values, 1 / np.sqrt(n_columns * 2))
-        values = [correlation(x.row[j], x.row[i], (0,)) for j, i in SAME_ROW]
-        sheet.add("static rows", "correlation, same row", values, 1 / np.sqrt(2 * rows))
-        values = [correlation(x.column[j], x.column[i], (0,)) for j, i in SAME_COLUMN]
-        sheet.add("static columns", "correlation, same column", values, 1 / np.sqrt(2 * columns))
+        for group, what, moving, pairs, n in (
+            ("column x frame", "same column", x.column_frame, SAME_COLUMN, n_columns),
+            ("static rows", "same row", x.row, SAME_ROW, rows),
+            ("static columns", "same column", x.column, SAME_COLUMN, columns),
+        ):
+            values = correlations(moving)[:, *np.transpose(pairs)]
+            sheet.add(group, f"correlation, {what}", values, 1 / np.sqrt(n * 2))
     if frames > 2:
-        later = _next(x.row_frame, 1)
+        later = _next(x.row_frame, 2)
         sheet.add("row x frame", "correlation with the next frame", later, 1 / np.sqrt(n_rows * planes))
-        later = _next(x.column_frame, 1)
+        later = _next(x.column_frame, 2)
         sheet.add("column x frame", "correlation with the next frame", later, 1 / np.sqrt(n_columns * planes))
 
 
 def _next(moving: np.ndarray, axis: int) -> np.ndarray:
-    """artanh of the correlation of neighbours along an axis of x [plane, frame, row or column], 0 for white noise."""
+    """artanh of the correlation of neighbours along an axis, 2 or 3, of x [exposure, plane, frame, line].
+
+    Of mean 0 for white noise.
+    """
     n = moving.shape[axis]
-    after, before = (np.take(moving, range(*ends), axis) for ends in ((1, n), (n - 1,)))
-    # n white numbers that sum to zero have correlation -1/(n - 1).
-    return correlation(after, before, (1, 2)) + 1 / (n - 1)
+    after, before = (moving[:, :, 1:], moving[:, :, :-1]) if axis == 2 else (moving[..., 1:], moving[..., :-1])
+    # What sums to zero over n has correlation -1/(n - 1).
+    return correlation(after, before, (2, 3)) + 1 / (n - 1)
 
 
 def _next_line(line: str, planes: int) -> str:
     return f"next {line} of the colour" if planes > 1 else f"next {line}"
 
 
-def scales(sheet: Sheet, x: Exposure) -> None:
-    """Static profiles by scale and parity, relative to what the frames' fluctuations leave in their mean."""
+def scales(sheet: Sheet, x: Exposures) -> None:
+    """Static profiles by scale and parity, against what the frames' fluctuations leave in their mean."""
     if x.shape[1] == 1:
         return
     for group, profile, moving in (
         ("static rows", x.row, x.row_frame),
         ("static columns", x.column, x.column_frame),
     ):
-        planes, frames, n = moving.shape
-        for level, (still, noise) in enumerate(zip(_haar(profile), _haar(moving), strict=True)):
-            value = log_ratio(frames * still, noise.mean(1) * frames / (frames - 1))
+        planes, frames, n = moving.shape[1:]
+        steps = _haar(np.concatenate([profile[:, :, None], moving], 2))
+        still, noise = steps[..., 0], steps[..., 1:].mean(-1) * frames / (frames - 1)
+        for level, value in enumerate(log_ratio(frames * still, noise)):
             independent = planes * max(n >> (level + 1), 1)
             sheet.add(group, f"steps of {1 << level}", value, np.sqrt(2 / independent * frames / (frames - 1)))
-            if level == 0:
-                finest = noise.mean(1) / (frames - 1)
-        sheet.add(group, "parity", _parity(profile, finest), 0.6)
-        basis = cosines(n)
-        still, noise = ((z @ basis.T).astype(np.float64) for z in (profile.sum(0), moving.sum(0)))
-        value = log_ratio((still**2).sum() * frames, (noise**2).sum() / (frames - 1))
+        sheet.add(group, "parity", _parity(profile, noise[0] / frames), 0.6)
+        basis = cosines(n).T
+        slow, fast = profile.sum(1) @ basis, moving.sum(1) @ basis
+        value = log_ratio((slow**2).sum(1) * frames, (fast**2).sum((1, 2)) / (frames - 1))
         sheet.add(group, "low-order shape", value, np.sqrt(2 / 3 * frames / (frames - 1)))
 
 
-def noise_of_rows(sheet: Sheet, x: Exposure) -> None:
-    """Whether rows change their noise from frame to frame, and neighbours change together (interference)."""
+def noise_of_rows(sheet: Sheet, x: Exposures) -> None:
+    """Whether the noise of single rows differs from frame to frame, and that of neighbours together (interference)."""
     planes, frames, rows, columns = x.shape
     spread = np.log(x.scale)
-    spread = (spread - spread.mean((1, 2), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
+    spread = (spread - spread.mean((2, 3), keepdims=True)) / np.sqrt(ABS_VARIANCE * np.pi / 2 / columns)
     n = planes * frames * rows
-    sheet.add("blocks", "noise of rows, spread", log_ratio(np.square(spread).mean((1, 2)), 1.0), np.sqrt(2 / n))
-    sheet.add("blocks", f"noise of rows, {_next_line('row', planes)}", _next(spread, 2), 1 / np.sqrt(n))
+    sheet.add("blocks", "noise of rows, spread", log_ratio(np.square(spread).mean((2, 3)), 1.0), np.sqrt(2 / n))
+    sheet.add("blocks", f"noise of rows, {_next_line('row', planes)}", _next(spread, 3), 1 / np.sqrt(n))
 
 
-def _haar(profile: np.ndarray) -> list[np.ndarray]:
-    """Mean squares of steps between neighbouring blocks of 1, 2, 4 ... values of a profile [..., n]; equal if white."""
+def _haar(profile: np.ndarray) -> np.ndarray:
+    """Mean squares [level, ...] of steps between neighbouring blocks of 1, 2, 4 ... lines of a profile [..., n].
+
+    Alike if white.
+    """
     n = profile.shape[-1]
     total = np.zeros((*profile.shape[:-1], n + 1))
     np.cumsum(profile, -1, out=total[..., 1:])
     out = []
-    for level in range(HAAR_LEVELS):
-        width = 1 << level
+    for width in (1 << level for level in range(HAAR_LEVELS)):
         if 2 * width > n:
             break
-        step = total[..., 2 * width :] - 2 * total[..., width:-width] + total[..., : -2 * width]
-        out.append((step**2).mean(-1) / (2 * width))
-    return out
+        block = total[..., width:] - total[..., :-width]
+        step = block[..., width:] - block[..., :-width]
+        out.append(np.square(step, out=step).mean(-1) / (2 * width))
+    return np.stack(out)
 
 
-def _parity(profile: np.ndarray, noise: np.ndarray) -> float:
-    """|contrast| of even and odd rows (columns) of a profile [plane, n] in standard errors, all planes together."""
-    signs = 1.0 - 2.0 * (np.arange(profile.shape[1]) % 2)
-    contrast = (profile @ signs) / np.sqrt(profile.shape[1] * (noise + TINY))
-    return abs(contrast.sum()) / np.sqrt(len(profile))
+def _parity(profile: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """|contrast| [exposure] of even and odd lines of a profile [exposure, plane, line], common to all planes.
+
+    In its standard errors, from the variance noise [exposure, plane].
+    """
+    _, planes, n = profile.shape
+    signs = 1.0 - 2.0 * (np.arange(n) % 2)
+    contrast = (profile @ signs) / np.sqrt(n * (noise + TINY))
+    return np.abs(contrast.sum(1)) / np.sqrt(planes)
 
 
+@lru_cache
 def cosines(n: int) -> np.ndarray:
-    """The three slowest cosines [3, n], orthonormal, of mean 0."""
-    return np.sqrt(2 / n) * np.cos(np.pi * np.outer(np.arange(1, 4), np.arange(n) + 0.5) / n)
+    """The three slowest cosines [3, n], orthonormal, without a mean."""
+    waves = np.sqrt(2 / n) * np.cos(np.pi * np.outer(np.arange(1, 4), np.arange(n) + 0.5) / n)
+    waves.setflags(write=False)
+    return waves
 
 
-def spectra(sheet: Sheet, x: Exposure) -> None:
-    """Spectra over rows and columns of what is new in each frame: shape, and coherence of the colours in one row."""
-    planes, frames, rows, columns = x.shape
+@lru_cache
+def _band_edges(n: int) -> list[int]:
+    """First frequency of each band of n, and n."""
+    return (np.unique(np.rint(np.geomspace(1, n + 1, BANDS + 1)).astype(int)) - 1).tolist()
+
+
+def spectra(sheet: Sheet, x: Exposures) -> None:
+    """Spectra over rows and columns of what is new in each frame: shape, and coherence of the colours of a line."""
+    planes, frames, _, _ = x.shape
     for group, moving, pairs in (
         ("row spectrum", x.row_frame, SAME_ROW),
         ("column x frame", x.column_frame, SAME_COLUMN),
     ):
         waves = np.fft.rfft(moving)[..., 1:]
-        power = np.square(np.abs(waves)).sum(1)
-        edges = np.unique(np.rint(np.geomspace(1, power.shape[-1] + 1, BANDS + 1)).astype(int)) - 1
-        level, bands = power.mean(-1), len(edges) - 1
-        for band, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-            n = max(frames - 1, 1) * (high - low)
-            value = log_ratio(power[:, low:high].mean(-1), level)
-            sheet.add(group, f"power in band {band + 1} of {bands}", value, 1 / np.sqrt(n * planes))
+        power = (np.square(waves.real) + np.square(waves.imag)).sum(2)
+        edges = _band_edges(power.shape[-1])
+        widths, bands = np.diff(edges), len(edges) - 1
+        of_band = np.add.reduceat(power, edges[:-1], -1)
+        values = log_ratio(of_band / widths, power.mean(-1, keepdims=True))
+        if planes == 4:
+            first, second = (list(planes) for planes in zip(*pairs, strict=True))
+            cross = (waves[:, first] * waves[:, second].conj()).real.sum(2)
+            size = np.maximum(of_band[:, first] * of_band[:, second], 1e-60)
+            coherence = fisher(np.add.reduceat(cross, edges[:-1], -1) / np.sqrt(size))
+        for band, width in enumerate(widths.tolist()):
+            n = max(frames - 1, 1) * width
+            name = f"in band {band + 1} of {bands}"
+            sheet.add(group, f"power {name}", values[..., band], 1 / np.sqrt(n * planes))
             if planes == 4:
-                cut = waves[..., low:high]
-                cross = [(cut[j] * cut[i].conj()).real.sum() for j, i in pairs]
-                size = [power[j, low:high].sum() * power[i, low:high].sum() for j, i in pairs]
-                value = fisher(np.array(cross) / np.sqrt(np.maximum(size, 1e-60)))
-                sheet.add(group, f"coherence of colours in band {band + 1} of {bands}", value, 1 / np.sqrt(4 * n))
+                sheet.add(group, f"coherence of colours {name}", coherence[..., band], 1 / np.sqrt(4 * n))
 
 
-def periodograms(x: Exposure) -> dict[str, np.ndarray]:
-    """Whitened periodograms over the rows and columns of the whole sensor (colours mixed), moving and static."""
-    step = 1 if x.shape[0] == 1 else 2
-    frames, rows, columns = x.shape[1:]
-    row = x.row_frame.reshape(step, step, frames, rows).mean(1).transpose(1, 2, 0).reshape(frames, -1)
-    column = x.column_frame.reshape(step, step, frames, columns).mean(0).transpose(1, 2, 0).reshape(frames, -1)
-    series = {"row x frame": row, "column x frame": column, **static_profiles(x)}
-    return {group: _whitened(values) for group, values in series.items()}
+def periodograms(x: Lines) -> dict[str, np.ndarray]:
+    """Whitened periodograms [exposure, frequency] over the lines of the whole sensor (colours mixed).
+
+    Rows and columns, what is new in each frame and what is static.
+    """
+    n, planes, frames, rows = x.row_frame.shape
+    step = 1 if planes == 1 else 2
+    row = x.row_frame.reshape(n, step, step, frames, rows).mean(2).transpose(0, 2, 3, 1)
+    column = x.column_frame.reshape(n, step, step, frames, -1).mean(1).transpose(0, 2, 3, 1)
+    moving = {"row x frame": row.reshape(n, frames, -1), "column x frame": column.reshape(n, frames, -1)}
+    static = {group: profile[:, None] for group, profile in static_profiles(x).items()}
+    return {group: _whitened(values, alternating=step > 1) for group, values in (moving | static).items()}
 
 
-def static_profiles(x: Exposure) -> dict[str, np.ndarray]:
-    """Means over frames of the sensor's rows and columns (colours mixed), [1, n] each; empty for a single frame."""
-    step = 1 if x.shape[0] == 1 else 2
-    _, frames, rows, columns = x.shape
+def static_profiles(x: Lines) -> dict[str, np.ndarray]:
+    """Mean of each row and column of the whole sensor (colours mixed) over the frames, [exposure, line].
+
+    None of one frame.
+    """
+    n, planes, frames, rows = x.row_frame.shape
     if frames == 1:
         return {}
-    row = x.row.reshape(step, step, rows).mean(1).T.reshape(1, -1)
-    column = x.column.reshape(step, step, columns).mean(0).T.reshape(1, -1)
-    return {"static rows": row, "static columns": column}
+    step = 1 if planes == 1 else 2
+    row = x.row.reshape(n, step, step, rows).mean(2).transpose(0, 2, 1)
+    column = x.column.reshape(n, step, step, -1).mean(1).transpose(0, 2, 1)
+    return {"static rows": row.reshape(n, -1), "static columns": column.reshape(n, -1)}
 
 
 def strongest_share(profile: np.ndarray) -> float:
-    """Log of the power of the strongest pair of neighbouring frequencies of a profile [1, n], over the mean power.
+    """Log of the power of the two neighbouring frequencies that have most of a profile [line], over the mean.
 
-    Independent rows spread over all frequencies; a period, a ramp or a shape does not. A spectral line between two
-    frequencies of the transform shares its power between them.
+    A pattern of independent lines spreads over all frequencies; a period, a ramp or a shape does not. A line between
+    two frequencies of the transform shares its power between them.
     """
-    power = np.square(np.abs(np.fft.rfft(profile[0])))[1:]
+    power = np.square(np.abs(np.fft.rfft(profile)))[1:]
     return float(log_ratio((power[1:] + power[:-1]).max(), power.mean()))
 
 
-def _whitened(series: np.ndarray) -> np.ndarray:
-    """Periodogram of series [frame, n], averaged over frames and divided by a power law: about 1 for any 1/f noise."""
-    power = np.square(np.abs(np.fft.rfft(series))).mean(0)[1 + WHITENED_FROM :] + 1e-12
-    frequency = np.log(np.arange(len(power)) + 1.0 + WHITENED_FROM)
-    slope, offset = np.polyfit(frequency, np.log(power), 1)
-    return power / np.exp(offset + slope * frequency)
+def _whitened(series: np.ndarray, *, alternating: bool) -> np.ndarray:
+    """Periodogram [exposure, frequency] of series [exposure, frame, n], averaged over frames, over a power law.
+
+    About 1 for any 1/f noise. alternating: the series takes turns between colours of mean zero, so that nothing but
+    rounding is left at half a cycle, which must not bend the law.
+    """
+    power = np.square(np.abs(np.fft.rfft(series))).mean(1)[:, 1 + WHITENED_FROM :] + 1e-12
+    frequency = np.log(np.arange(power.shape[1]) + 1.0 + WHITENED_FROM)
+    some = slice(power.shape[1] - alternating)
+    frequency -= frequency[some].mean()
+    log_power = np.log(power[:, some])
+    slope = log_power @ frequency[some] / np.square(frequency[some]).sum()
+    return power / np.exp(log_power.mean(1, keepdims=True) + slope[:, None] * frequency)
 
 
 def peak(periodogram: np.ndarray) -> float:
-    """Log of the largest value over a running median around it, which a 1/f rise does not move."""
+    """Log of the largest value over its surroundings (a running median), which a 1/f rise does not move."""
     width = min(31, len(periodogram) // 4 * 2 + 1)
     return float(
         log_ratio(np.max(periodogram / (scipy.ndimage.median_filter(periodogram, width, mode="reflect") + 1e-12)), 1.0)
@@ -216,10 +262,10 @@ def peak(periodogram: np.ndarray) -> float:
 
 
 def strongest_line(height: np.ndarray, n: int) -> tuple[float, float]:
-    """Height and frequency (cycles per row or column) of the highest peak of a whitened periodogram of n of them."""
+    """The highest of a periodogram about 1 of n sensor rows (columns), and its frequency, cycles each."""
     i = int(np.argmax(height))
     around = np.sqrt(np.maximum(np.pad(height, 1, constant_values=1.0)[i : i + 3] - 1, 0))
-    # The amplitudes at the two nearest frequencies of the transform give the line's distance from each.
+    # A line between two frequencies of the transform has amplitudes there as its distances from them.
     left, right = around[[0, 2]] / max(around[1] + max(around[0], around[2]), 1e-12)
     offset = right if right > left else -left
     return float(height[i]), float(min((i + 1 + WHITENED_FROM + offset) / n, 0.5))

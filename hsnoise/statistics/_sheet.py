@@ -1,15 +1,17 @@
-"""The statistics of one exposure, and their averages over exposures."""
+"""The statistics of exposures, and how those of one half are averaged."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 ABS_VARIANCE = 1 - 2 / np.pi  # of |x| of a standard normal x
-TINY_DN2 = 1e-4  # far below the variance of rounding; keeps the logarithm of a zero variance finite
+TINY_DN2 = 1e-4  # far below the variance of rounding: keeps logarithms of empty variances finite
 LARGEST_CORRELATION = 0.9999
 
 
@@ -19,66 +21,96 @@ def log_ratio(above: np.ndarray, below: np.ndarray | float) -> np.ndarray:
 
 
 def fisher(correlation: np.ndarray) -> np.ndarray:
-    """artanh of correlations: its standard error is 1/sqrt(n) for any correlation."""
+    """artanh of correlations: standard error 1/sqrt(n) whatever their size."""
     return np.arctanh(np.clip(correlation, -LARGEST_CORRELATION, LARGEST_CORRELATION))
 
 
 def correlation(a: np.ndarray, b: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     """artanh of the uncentred correlation of two arrays over `axes`; 0 where one of them is all zero."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     power = (a * a).sum(axes) * (b * b).sum(axes)
     return fisher((a * b).sum(axes) / np.sqrt(np.maximum(power, 1e-60)))
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A statistic of one exposure: a value with its standard error, or a number of rare pixels.
+def correlations(x: np.ndarray) -> np.ndarray:
+    """artanh of the uncentred correlations of the planes of x [exposure, plane, ...]: [exposure, plane, plane]."""
+    flat = x.reshape(*x.shape[:2], -1)
+    product = flat @ flat.transpose(0, 2, 1)
+    power = np.diagonal(product, axis1=1, axis2=2)
+    return fisher(product / np.sqrt(np.maximum(power[:, :, None] * power[:, None], 1e-60)))
 
-    of_map: whether it describes the static map itself, which in flats shows the shape of the light.
-    """
+
+class Entry(NamedTuple):
+    """A statistic with its standard error. of_map: whether it is of the shape of the static map, as light has one."""
 
     value: float
     error: float
-    is_count: bool = False
     of_map: bool = False
 
 
-@dataclass
+@lru_cache
+def planes_by_colour(letters: tuple[str, ...]) -> tuple[tuple[str, list[int]], ...]:
+    """Of each colour, what follows the name of its statistics, and its planes."""
+    return tuple(
+        ("" if colour == "mono" else f", {colour}", [i for i, letter in enumerate(letters) if letter == colour])
+        for colour in dict.fromkeys(letters)
+    )
+
+
+@dataclass(eq=False)
 class Sheet:
-    """The statistics of one exposure by (group, what). `letters` [plane] is the colour of each plane."""
+    """The statistics of exposures with one number of frames. `letters` [plane] is the colour of each plane.
+
+    exposures: their numbers. values, errors: [exposure], by (group, what); counts: which are numbers of rare pixels;
+    maps: which are of the shape of the static map.
+    """
 
     letters: tuple[str, ...]
-    entries: dict[tuple[str, str], Entry] = field(default_factory=dict)
+    exposures: list[int]
+    values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    errors: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    counts: set[tuple[str, str]] = field(default_factory=set)
+    maps: set[tuple[str, str]] = field(default_factory=set)
 
-    def add(self, group: str, what: str, values: np.ndarray | float, error: float, *, of_map: bool = False) -> None:
-        """The mean of `values` over all axes; `error` is the standard error of that mean."""
-        values = np.asarray(values, np.float64)
-        self.entries[group, what] = Entry(float(values.sum() / values.size), float(error), of_map=of_map)
+    def add(
+        self, group: str, what: str, values: np.ndarray, error: np.ndarray | float, *, of_map: bool = False
+    ) -> None:
+        """The mean of values [exposure, ...] over all further axes; `error` is the standard error of that mean."""
+        n = len(self.exposures)
+        if values.ndim > 1:
+            values = values.reshape(n, -1).sum(1) / (values.size // n)
+        self.values[group, what] = values
+        self.errors[group, what] = np.full(n, error)
+        if of_map:
+            self.maps.add((group, what))
 
-    def add_count(self, group: str, what: str, number: float, *, of_map: bool = False) -> None:
-        self.entries[group, what] = Entry(float(number), 0.5, is_count=True, of_map=of_map)
+    def add_count(self, group: str, what: str, numbers: np.ndarray, *, of_map: bool = False) -> None:
+        self.add(group, what, numbers, 0.5, of_map=of_map)
+        self.counts.add((group, what))
 
-    def add_colours(self, group: str, what: str, values: np.ndarray, error: float) -> None:
-        """One statistic per colour from values [plane]; `error` is that of one plane."""
-        for colour in dict.fromkeys(self.letters):
-            of = [i for i, letter in enumerate(self.letters) if letter == colour]
-            name = what if colour == "mono" else f"{what}, {colour}"
-            self.add(group, name, np.asarray(values)[of], error / np.sqrt(len(of)))
+    def add_colours(self, group: str, what: str, values: np.ndarray, error: np.ndarray | float) -> None:
+        """One statistic a colour from values [exposure, plane]; `error` is that of one plane."""
+        for colour, planes in planes_by_colour(self.letters):
+            self.add(group, f"{what}{colour}", values[:, planes], error / math.sqrt(len(planes)))
 
 
-def gather(sheets: Sequence[Sheet], half: str) -> dict[tuple[str, str], Entry]:
-    """The statistics of the exposures of one half: means, and square roots of summed numbers.
+def gather(sheets: Sequence[Sheet], half: str, chosen: Sequence[int]) -> dict[tuple[str, str], Entry]:
+    """The statistics of the `chosen` exposures: means, and square roots of summed numbers.
 
-    Exposures with few frames lack some statistics: each mean is over the exposures that have it.
+    An exposure of few frames has fewer statistics than others: the mean is over those that have one.
     """
-    keys = dict.fromkeys(key for sheet in sheets for key in sheet.entries)
-    out = {}
-    for group, what in keys:
-        found = [sheet.entries[group, what] for sheet in sheets if (group, what) in sheet.entries]
-        total = sum(entry.value for entry in found)
-        if found[0].is_count:
-            value, error = math.sqrt(total), 0.5
-        else:
-            value, error = total / len(found), math.sqrt(sum(entry.error**2 for entry in found)) / len(found)
-        out[group, f"{what}, {half}"] = Entry(value, error, of_map=found[0].of_map)
-    return out
+    sheet_of = {number: sheet for sheet in sheets for number in sheet.exposures}
+    some = dict.fromkeys(sheet_of[number] for number in chosen)
+    place = {key: i for i, key in enumerate(dict.fromkeys(key for sheet in some for key in sheet.values))}
+    number, total, square = np.zeros((3, len(place)))
+    for sheet in some:
+        where = [place[key] for key in sheet.values]
+        of = [i for i, exposure in enumerate(sheet.exposures) if exposure in chosen]
+        number[where] += len(of)
+        total[where] += np.array(list(sheet.values.values()))[:, of].sum(1)
+        square[where] += np.square(np.array(list(sheet.errors.values()))[:, of]).sum(1)
+    mean, error = total / number, np.sqrt(square) / number
+    for i in (place[key] for key in set().union(*(sheet.counts for sheet in some))):
+        mean[i], error[i] = math.sqrt(total[i]), 0.5
+    maps = set().union(*(sheet.maps for sheet in some))
+    entries = map(Entry, mean.tolist(), error.tolist(), [key in maps for key in place])
+    return {(group, f"{what}, {half}"): entry for (group, what), entry in zip(place, entries, strict=True)}

@@ -1,81 +1,78 @@
-"""What persists between exposures: static maps, profiles and variances of the same pixels are compared."""
+"""What persists from one exposure to the next: static maps, profiles and variances of the same pixels, compared."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its submodules are imported on first use
+import scipy  # its parts are imported when they are used
 
-from hsnoise.statistics._anova import BOUND, Exposure
-from hsnoise.statistics._pixels import log_temporal_variance
+from hsnoise.statistics._exposures import BOUND, Exposures, normalised
 from hsnoise.statistics._sheet import Entry, fisher, log_ratio
 
-OUTLIER = 4.0
 OUTLIERS = (1, 2, 3, 5)
-MOST_VARIANCE = 50.0  # of a pixel, in units of its row's: one hit must not dominate all pixels
+MOST_VARIANCE = 50.0  # of a pixel, in units of its row's: one hit must not stand for all pixels
 MOST_MAP_SIDE = 512
-VARIANCE_FRAMES = 3
 
 
 @dataclass(frozen=True)
 class View:
     """The static part of one exposure, or of its even or odd frames.
 
-    half: 0 short, 1 long (or even, odd). pixel [plane, row, column] in units of its robust spread; row [plane, row] and
-    column [plane, column], DN; log_variance [plane, row, column] over time, None if frames are too few.
+    half: 0 low, 1 high (even, odd). pixel [plane, row, column] in units of its robust spread; row [plane, row] and
+    column [plane, column], DN; temporal [plane, row, column], the variance over time, empty with too few frames.
     """
 
     half: int
     pixel: np.ndarray
     row: np.ndarray
     column: np.ndarray
-    log_variance: np.ndarray | None
+    temporal: np.ndarray
 
 
-def view_of(x: Exposure, half: int, log_variance: np.ndarray | None) -> View:
-    return View(half, _normalised(x.pixel), x.row, x.column, log_variance)
+def views_of(x: Exposures, halves: Sequence[int]) -> list[View]:
+    """A view of each exposure."""
+    maps = (x.map, x.row, x.column, x.temporal)
+    return [View(half, *(of[i] for of in maps)) for i, half in enumerate(halves)]
 
 
-def even_and_odd(x: Exposure) -> Iterator[View]:
-    """Views of the even and the odd frames of one exposure, for captures with only one."""
-    for parity in (0, 1):
-        some = x.residual[:, parity::2]
-        mean = (some * x.scale[:, parity::2, :, None]).mean(1)
-        row, column = x.row_frame[:, parity::2].mean(1), x.column_frame[:, parity::2].mean(1)
-        enough = some.shape[1] >= VARIANCE_FRAMES and x.shape[1] // 2 >= VARIANCE_FRAMES
-        log_variance = log_temporal_variance(some - some.mean(1, keepdims=True)) if enough else None
-        yield View(parity, _normalised(x.pixel + mean), x.row + row, x.column + column, log_variance)
-
-
-def _normalised(pixel: np.ndarray) -> np.ndarray:
-    return pixel / (np.abs(pixel).mean((1, 2), keepdims=True) * np.float32(np.sqrt(np.pi / 2)) + np.float32(1e-6))
+def even_and_odd(x: Exposures) -> list[View]:
+    """Views of the even and of the odd frames of one exposure, for captures that have no other."""
+    views = []
+    for parity, (pixel, temporal) in enumerate(zip(x.half_pixel[0], x.half_temporal[0], strict=True)):
+        row, column = (moving[0, :, parity::2].mean(1) for moving in (x.row_frame, x.column_frame))
+        views.append(View(parity, normalised(pixel), x.row[0] + row, x.column[0] + column, temporal))
+    return views
 
 
 def persistence(views: list[View], names: tuple[str, str]) -> dict[tuple[str, str], Entry]:
     """Correlations of maps and profiles between exposures: both short, short and long, both long."""
     pixel = np.stack([view.pixel for view in views], 1)
+    bounded = np.clip(pixel, -BOUND, BOUND)
     out = _pairs(views, names, pixel, "static pixels", "raw map")
-    out |= _pairs(views, names, np.clip(pixel, -BOUND, BOUND), "static pixels", "map")
+    out |= _pairs(views, names, bounded, "static pixels", "map")
     out |= _pairs(views, names, np.stack([view.row for view in views], 1), "static rows", "profile")
     out |= _pairs(views, names, np.stack([view.column for view in views], 1), "static columns", "profile")
-    timed = [(view, view.log_variance) for view in views if view.log_variance is not None]
+    timed = [view for view in views if view.temporal.size]
     if len(timed) > 1:
-        log_variance, some = np.stack([values for _, values in timed], 1), [view for view, _ in timed]
-        out |= _pairs(some, names, log_variance, "pixels over time", "log variance")
-        variance = np.minimum(np.exp(log_variance), np.float32(MOST_VARIANCE))
-        out |= _pairs(some, names, variance, "pixels over time", "variance")
+        variance = np.stack([view.temporal for view in timed], 1)
+        out |= _pairs(timed, names, np.log(variance), "pixels over time", "log variance")
+        np.minimum(variance, np.float32(MOST_VARIANCE), out=variance)
+        out |= _pairs(timed, names, variance, "pixels over time", "variance")
     return out
 
 
 def _pairs(
     views: list[View], names: tuple[str, str], maps: np.ndarray, group: str, what: str
 ) -> dict[tuple[str, str], Entry]:
-    """artanh of the correlations of maps [plane, view, ...], averaged over planes and the pairs of each kind."""
+    """artanh of the correlations of maps [plane, view, ...], averaged over planes and the pairs of each kind.
+
+    The maps lose their means.
+    """
     planes, n_views = maps.shape[:2]
     flat = maps.reshape(planes, n_views, -1)
-    flat = flat - flat.mean(-1, keepdims=True)
+    flat -= flat.mean(-1, keepdims=True)
     gram = (flat @ flat.transpose(0, 2, 1)).astype(np.float64)
     power = np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-30)
     values = fisher(gram / np.sqrt(power[:, :, None] * power[:, None]) * (1 - np.eye(n_views))).mean(0)
@@ -97,13 +94,11 @@ def map_peak(views: list[View]) -> float:
     return float(log_ratio(power.max() / max(float(np.median(power)), 1e-12), 1.0))
 
 
-def outliers_of(x: Exposure) -> np.ndarray:
-    """Number of frames [plane, row, column] in which each pixel lies far from its mean."""
-    return (np.abs(x.bounded) > OUTLIER).sum(1, dtype=np.uint16)
-
-
 def outlier_counts(outliers: np.ndarray) -> dict[tuple[str, str], Entry]:
-    """Square roots of the numbers of pixels by their number of outliers: hits come alone, jumping pixels repeat."""
+    """From outliers [plane, row, column], the number of frames in which a pixel lies far from its mean.
+
+    Square root of the number of pixels with so many outliers: hits come alone, jumping pixels repeat.
+    """
     out = {}
     for number in OUTLIERS:
         exact = number < 3

@@ -7,27 +7,29 @@ camera. Mostly correlations separate effects: between colours, frames, exposures
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics import _lines, _pixels, _views
-from hsnoise.statistics._anova import Exposure, Layout, check_size, layout_of, read_exposure
+from hsnoise.statistics._anova import Layout, analyse, check_size, layout_of, read_counts, shape_of, signal_of
 from hsnoise.statistics._codes import code_step
-from hsnoise.statistics._places import places
+from hsnoise.statistics._exposures import VARIANCE_FRAMES, Exposures, exposures_of, joined
+from hsnoise.statistics._histograms import histogram_shape
+from hsnoise.statistics._places import Places, places
 from hsnoise.statistics._sheet import TINY_DN2, Entry, Sheet, gather
 
-__all__ = ["SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
+__all__ = ["Places", "SHORT", "Structure", "check_size", "code_step", "explained", "moving_line", "places", "structure"]
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Statistics of one capture. Names, groups and order depend only on sizes, colours and numbers of frames.
+    """Statistics of one capture. Names, groups and order depend on sizes, colours and numbers of frames only.
 
-    values [statistic]: finite. error [statistic]: rough standard error for independent pixels, a floor for the
-    spread over a model's draws. skipped: sentences on what was left out and why.
+    values [statistic]: finite. error [statistic]: rough standard error under independent pixels, a floor for the
+    spread over a model's draws. skipped: sentences on what was left out, and why.
     """
 
     names: tuple[str, ...]
@@ -36,6 +38,23 @@ class Structure:
     error: np.ndarray
     skipped: tuple[str, ...]
 
+
+BATCH_PIXELS = 1 << 20  # of the maps of exposures whose statistics are taken together
+PIXELS_AT_WORK = 1 << 21  # of the frames read together
+STATISTICS = (
+    _pixels.levels,
+    _pixels.codes,
+    _lines.variances,
+    _lines.colours,
+    _lines.scales,
+    _lines.noise_of_rows,
+    _lines.spectra,
+    _pixels.lags,
+    _pixels.tails,
+    _pixels.frames_over_time,
+    _pixels.blocks,
+    _pixels.variance_over_time,
+)
 
 SHORT = "short exposures"
 WORDS = {
@@ -55,8 +74,8 @@ WORDS = {
     "roughness": "roughness: how much a histogram jumps from code to code",
 }
 
-# What flats tell whatever the light, and what it is called there: neither the light's level, its flicker nor its shape,
-# to which dust belongs.
+# The statistics of flats that do not depend on the light (its level, flicker or shape, including dust), and what they
+# are called there.
 OF_FLATS = {
     group: f"flats, {group}"
     for group in (
@@ -71,12 +90,12 @@ OF_FLATS = {
 }
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # `_ordered` replaces non-finite values by 0
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
 def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
-    """The statistics of the exposures of a stack, darks and flats separately.
+    """The statistics of the exposures of a stack, darks and flats apart.
 
-    They are averaged over the shorter and the longer half of the exposure times. A single exposure is averaged over all
-    its frames; persistence is then judged from its even and odd frames.
+    Exposures are averaged over the shorter half and the longer half of the exposure times. A single exposure gives
+    averages over all its frames; what persists is then compared between its even and odd frames.
 
     Args:
         stack: the capture.
@@ -102,66 +121,100 @@ def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> d
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("short", "long") if n > 1 else ("even", "odd")
-    capture = _Capture([], [], [], [], [], np.zeros(1, np.uint16))
-    for number in range(n):
-        x = read_exposure(stack, layout, number, black_level_dn)
-        capture.add(x, layout, halves[number], stack.white_level, alone=n == 1)
+    sheets, found, outliers = [], {}, np.zeros(1, np.uint16)
+    for numbers in _batches(layout):
+        x = _read(stack, layout, numbers, black_level_dn)
+        sheets.append(_sheet(x, layout.letters, numbers))
+        found |= dict(zip(numbers, _kept(x, [halves[i] for i in numbers]), strict=True))
+        if x.shape[1] >= VARIANCE_FRAMES:
+            outliers = outliers + x.outliers.sum(0, dtype=np.uint16)
+        del x
+    kept = [found[i] for i in range(n)]
+    spectra, views = [of.spectra for of in kept], [view for of in kept for view in of.views]
     entries: dict[tuple[str, str], Entry] = {}
     for half in sorted(set(halves)):
         some = [i for i in range(n) if halves[i] == half]
-        entries |= gather([capture.sheets[i] for i in some], f"{names[half]} exposures" if n > 1 else "all frames")
+        entries |= gather(sheets, f"{names[half]} exposures" if n > 1 else "all frames", some)
         if n > 1:
-            entries |= _peaks([capture.spectra[i] for i in some], f"{names[half]} exposures")
-    entries |= _peaks(capture.spectra, "all exposures" if n > 1 else "all frames")
-    entries |= _shares(capture.profiles)
-    if len(capture.views) > 1:
-        entries |= _views.persistence(capture.views, names)
+            entries |= _peaks([spectra[i] for i in some], f"{names[half]} exposures")
+    entries |= _peaks(spectra, "all exposures" if n > 1 else "all frames")
+    entries |= _shares([of.profiles for of in kept])
+    if len(views) > 1:
+        entries |= _views.persistence(views, names)
     if max(layout.frames) > 1:
-        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(capture.views), 0.15)
-    if max(layout.frames) > 2:
-        entries |= _views.outlier_counts(capture.outliers)
-    return entries | _curvature(capture.exposures, layout)
+        entries["blocks", "peak of the static map's spectrum"] = Entry(_views.map_peak(views), 0.15)
+    if max(layout.frames) >= VARIANCE_FRAMES:
+        entries |= _views.outlier_counts(outliers)
+    return entries | _curvature(kept, layout)
 
 
-@dataclass
-class _Capture:
-    """The statistics of the exposures read so far, without their frames."""
+def _batches(layout: Layout) -> list[list[int]]:
+    """Numbers of the exposures whose statistics are taken together: of as many frames, and of few pixels."""
+    alike = ([i for i, n in enumerate(layout.frames) if n == frames] for frames in dict.fromkeys(layout.frames))
+    return [numbers for some in alike for numbers in _pieces(some, BATCH_PIXELS // _pixels_of(layout))]
 
-    sheets: list[Sheet]
-    spectra: list[dict[str, np.ndarray]]
-    profiles: list[dict[str, np.ndarray]]
+
+def _pieces(numbers: list[int], most: int) -> list[list[int]]:
+    """Runs of at most `most` of the numbers, and of at least one."""
+    most = max(most, 1)
+    return [numbers[start : start + most] for start in range(0, len(numbers), most)]
+
+
+def _pixels_of(layout: Layout) -> int:
+    return (layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start)
+
+
+def _read(stack: FrameStack, layout: Layout, numbers: list[int], black_level_dn: np.ndarray) -> Exposures:
+    """Exposures with one number of frames, of which no frames are kept."""
+    frames = layout.frames[numbers[0]]
+    pieces = _pieces(numbers, PIXELS_AT_WORK // (frames * _pixels_of(layout)))
+    work = np.empty((2, *shape_of(layout, pieces[0])), np.float32)
+    found = []
+    for some in pieces:
+        spare, signal = work[:, : len(some)]
+        counts = spare.view(np.int32)
+        read_counts(stack, layout, some, counts)
+        codes = np.array([[histogram_shape(plane, stack.white_level) for plane in planes] for planes in counts])
+        signal_of(counts, layout, black_level_dn, signal)
+        found.append(exposures_of(*analyse(signal), codes, spare, halves=len(layout.frames) == 1 < frames))
+    return joined(found)
+
+
+def _sheet(x: Exposures, letters: tuple[str, ...], numbers: list[int]) -> Sheet:
+    """All statistics that exposures have each by itself."""
+    sheet = Sheet(letters, numbers)
+    for statistics in STATISTICS:
+        statistics(sheet, x)
+    return sheet
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of one exposure besides its sheet; never its frames. mean [plane], DN; variance [plane], DN^2."""
+
+    spectra: dict[str, np.ndarray]
+    profiles: dict[str, np.ndarray]
     views: list[_views.View]
-    exposures: list[tuple[np.ndarray, np.ndarray]]
-    outliers: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
 
-    def add(self, x: Exposure, layout: Layout, half: int, white_level: float | None, *, alone: bool) -> None:
-        sheet = Sheet(layout.letters)
-        _pixels.levels(sheet, x, white_level)
-        _lines.variances(sheet, x)
-        _lines.colours(sheet, x)
-        _lines.scales(sheet, x)
-        _lines.noise_of_rows(sheet, x)
-        _lines.spectra(sheet, x)
-        _pixels.lags(sheet, x)
-        _pixels.tails(sheet, x)
-        _pixels.frames_over_time(sheet, x)
-        _pixels.blocks(sheet, x)
-        log_variance = None
-        if x.shape[1] >= _views.VARIANCE_FRAMES:
-            log_variance = _pixels.log_temporal_variance(x.residual)
-            _pixels.variance_over_time(sheet, x, log_variance)
-            self.outliers = self.outliers + _views.outliers_of(x)
-        self.sheets.append(sheet)
-        self.spectra.append(_lines.periodograms(x))
-        self.profiles.append(_lines.static_profiles(x))
-        self.exposures.append((x.mean, x.variance))
-        self.views.extend(
-            _views.even_and_odd(x) if alone and x.shape[1] > 1 else [_views.view_of(x, half, log_variance)]
+
+def _kept(x: Exposures, halves: list[int]) -> Iterator[Kept]:
+    """Of each exposure; halves: which half it belongs to."""
+    spectra, profiles = _lines.periodograms(x), _lines.static_profiles(x)
+    views = [_views.even_and_odd(x)] if x.half_pixel.size else [[view] for view in _views.views_of(x, halves)]
+    for i, own in enumerate(views):
+        yield Kept(
+            {group: values[i] for group, values in spectra.items()},
+            {group: values[i] for group, values in profiles.items()},
+            own,
+            x.mean[i],
+            x.variance[i],
         )
 
 
 def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, str], Entry]:
-    """Highest peaks of the periodograms, averaged over exposures."""
+    """Highest lines of the periodograms averaged over exposures."""
     out = {}
     for group, mean in _averages(spectra).items():
         where = "row spectrum" if group == "row x frame" else group
@@ -170,36 +223,39 @@ def _peaks(spectra: list[dict[str, np.ndarray]], half: str) -> dict[tuple[str, s
 
 
 def _shares(profiles: list[dict[str, np.ndarray]]) -> dict[tuple[str, str], Entry]:
-    """The strongest frequency's share of static rows and columns, averaged over exposures."""
+    """How much one frequency has of the static rows and columns, averaged over exposures."""
     shares = {group: _lines.strongest_share(mean) for group, mean in _averages(profiles).items()}
     return {(group, "strongest frequency"): Entry(share, 0.15) for group, share in shares.items()}
 
 
 def _averages(exposures: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Mean by group over the exposures that have it: single frames have no static part."""
+    """Mean by group, over the exposures that have it: those of one frame have nothing static."""
     groups = dict.fromkeys(group for of in exposures for group in of)
     return {group: np.mean([of[group] for of in exposures if group in of], 0) for group in groups}
 
 
 def explained(names: Iterable[str]) -> tuple[str, ...]:
-    """Sentences that explain the technical words in names of statistics."""
+    """Sentences on the words in names of statistics that are not plain."""
     text = "; ".join(names)
     return tuple(sentence for word, sentence in WORDS.items() if word in text)
 
 
 def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: np.ndarray) -> tuple[str, float]:
-    """The strongest spectral line that is new in each dark frame: "row" or "column", and its frequency in cycles each.
+    """The strongest line that is new in each dark frame: over "row" or "column", and its frequency, cycles each.
 
-    Strength is relative to the spectra of a model's `draws`: rows of a Bayer pattern with 1/f gains have a peak at
-    half a cycle, because colours alternate.
+    Strong is what exceeds the spectra of a model's `draws`: rows of a Bayer pattern with 1/f gains have a peak at
+    half a cycle, as colours take turns.
     """
     layout = layout_of(stack)
     used = {"row": layout.rows, "column": layout.columns}
 
     def spectra(capture: FrameStack) -> dict[str, np.ndarray]:
-        read = (read_exposure(capture, layout, i, black_level_dn) for i in range(len(layout.frames)))
-        found = [_lines.periodograms(x) for x in read]
-        return {axis: np.stack([of[f"{axis} x frame"] for of in found]) for axis in used}
+        found = []
+        for i in range(len(layout.frames)):
+            counts = np.empty(shape_of(layout, [i]), np.int32)
+            read_counts(capture, layout, [i], counts)
+            found.append(_lines.periodograms(analyse(signal_of(counts, layout, black_level_dn))[0]))
+        return {axis: np.concatenate([of[f"{axis} x frame"] for of in found]) for axis in used}
 
     step = 1 if layout.cfa == "mono" else 2
     expected = [spectra(drawn) for drawn in draws]
@@ -212,27 +268,26 @@ def moving_line(stack: FrameStack, draws: Sequence[FrameStack], black_level_dn: 
     return axis, frequency
 
 
-def _curvature(exposures: list[tuple[np.ndarray, np.ndarray]], layout: Layout) -> dict[tuple[str, str], Entry]:
-    """Distance of the middle exposure's mean and variance from the straight line through the first and the last."""
-    if len(exposures) < 3:
+def _curvature(kept: list[Kept], layout: Layout) -> dict[tuple[str, str], Entry]:
+    """How far mean and variance of the middle exposure lie off the line through the first and the last."""
+    if len(kept) < 3:
         return {}
-    middle = len(exposures) // 2
+    middle = len(kept) // 2
     first, between, last = layout.exposure_s[[0, middle, -1]]
     share = (between - first) / (last - first) if last > first else 0.5
-    (mean0, variance0), (mean1, variance1), (mean2, variance2) = (exposures[i] for i in (0, middle, -1))
+    mean, variance = (np.stack([getattr(kept[i], of) for i in (0, middle, -1)]) for of in ("mean", "variance"))
     size = np.array([layout.frames[i] for i in (0, middle, -1)])
-    pixels = (layout.rows.stop - layout.rows.start) * (layout.columns.stop - layout.columns.start)
-    error = float(np.sqrt((len(layout.letters) / (size * pixels)).sum()))
-    sheet = Sheet(layout.letters)
-    bent = (mean1 - (1 - share) * mean0 - share * mean2) / np.sqrt(variance1 + TINY_DN2)
-    sheet.add_colours("level", "curvature of the mean over exposure", bent, error)
-    bent = variance1 / ((1 - share) * variance0 + share * variance2 + TINY_DN2)
-    sheet.add_colours("noise", "curvature of the variance over exposure", bent, error * np.sqrt(2))
-    return sheet.entries
+    error = float(np.sqrt((len(layout.letters) / (size * _pixels_of(layout))).sum()))
+    sheet = Sheet(layout.letters, [middle])
+    bent = (mean[1] - (1 - share) * mean[0] - share * mean[2]) / np.sqrt(variance[1] + TINY_DN2)
+    sheet.add_colours("level", "curvature of the mean over exposure", bent[None], error)
+    bent = variance[1] / ((1 - share) * variance[0] + share * variance[2] + TINY_DN2)
+    sheet.add_colours("noise", "curvature of the variance over exposure", bent[None], error * np.sqrt(2))
+    return {key: Entry(value.item(), sheet.errors[key].item()) for key, value in sheet.values.items()}
 
 
 def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure:
-    """All statistics, group by group; non-finite values carry no information and become 0 in captures and draws."""
+    """All statistics, group by group; what is not finite has no meaning and is 0 in captures and draws alike."""
     keys = sorted(entries, key=lambda key: key[0])
     return Structure(
         names=tuple(f"{group}: {what}" for group, what in keys),
@@ -244,19 +299,17 @@ def _ordered(entries: dict[tuple[str, str], Entry], layout: Layout) -> Structure
 
 
 def _too_few(layout: Layout) -> tuple[str, ...]:
-    """Sentences on statistics that need more frames or exposures."""
+    """Sentences on the statistics that the numbers of frames and exposures do not allow."""
     frames, n = max(layout.frames), len(layout.frames)
     out = []
     if frames < 2:
-        out.append("A single frame cannot separate static patterns from noise: statistics of two frames are left out.")
-    elif frames < _views.VARIANCE_FRAMES:
-        out.append("Two frames give no variance over time for each pixel: statistics of three frames are left out.")
+        out.append("A single frame does not tell static patterns from noise: what needs two frames is left out.")
+    elif frames < VARIANCE_FRAMES:
+        out.append("Two frames do not give a variance over time for each pixel: what needs three frames is left out.")
     if 2 <= frames < 4:
-        out.append("Separating flicker from drift takes four frames: their statistics are left out.")
-    if n == 1 and frames // 2 < _views.VARIANCE_FRAMES:
-        out.append("Testing whether noisy pixels stay noisy takes two exposures or six frames: this is left out.")
+        out.append("Flicker and drift are told apart from four frames on: their statistics are left out.")
+    if n == 1 and frames // 2 < VARIANCE_FRAMES:
+        out.append("Whether noisy pixels stay noisy needs two exposures or six frames: it is left out.")
     if n < 3:
-        out.append(
-            "Testing whether mean and variance are proportional to exposure takes three exposures: this is left out."
-        )
+        out.append("Whether mean and variance grow in proportion to exposure needs three exposures: it is left out.")
     return tuple(out)

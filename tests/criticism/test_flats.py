@@ -9,7 +9,7 @@ from hsnoise.criticism.reference import measure
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.criticism.candidates import built_in
+from hsnoise.criticism.candidates import built_in, facts_of
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation.draws import draw_capture, light_of
 from hsnoise.simulation.portion import Portion
@@ -62,10 +62,10 @@ def test_what_dust_does_to_the_light_is_no_noise(plain):
 
 
 def test_a_curve_is_no_candidate_where_two_levels_tell_of_a_line_only(plain):
-    whole = built_in(CAMERA, plain)
+    whole = built_in(facts_of(CAMERA, plain))
     one_dark_one_flat = plain.select(exposures=[1, 3])
     assert "nonlinearity" in whole
-    assert whole.keys() - built_in(CAMERA, one_dark_one_flat).keys() >= {"nonlinearity"}
+    assert whole.keys() - built_in(facts_of(CAMERA, one_dark_one_flat)).keys() >= {"nonlinearity"}
 
 
 def test_draws_are_as_bright_as_the_capture(plain):

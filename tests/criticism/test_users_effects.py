@@ -28,6 +28,24 @@ class Mine(hsnoise.AbstractEffect):
         return self.change(signal)
 
 
+class Proposing(hsnoise.AbstractEffect):
+    """Does what `change` does, as strongly as `propose` says."""
+
+    name: ClassVar[str] = "proposing"
+    stage: ClassVar[hsnoise.Stage] = hsnoise.Stage.READ
+    least_frames: ClassVar[int] = 3
+    sigma: jax.Array = hsnoise.param("e-", low=0, amplitude=True, doc="standard deviation over frames")
+    change: ClassVar[Callable] = staticmethod(lambda signal: signal)
+    proposal: ClassVar[Callable | None] = staticmethod(lambda size, rng: Proposing(size * rng.uniform(1, 2)))
+
+    def sample(self, signal, capture, *, key):
+        return type(self).change(signal) + self.sigma * jax.random.normal(key, (len(signal), 1, 1), signal.dtype)
+
+    @classmethod
+    def propose(cls, facts):
+        return cls.proposal
+
+
 FAULTS = {
     "shape": (lambda signal: signal[:, 1:], r"my_effect: .* returned shape \(\d+, 31, 48\), expected \(\d+, 32, 48\)"),
     "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
@@ -116,7 +134,48 @@ def test_arguments_are_named(call):
         call(CAMERA, COUNTS[:, :, :30], **CAPTURE)
 
 
-@pytest.mark.parametrize("candidate", [Mine, "row_noise", 3])
+def test_a_class_of_a_user_proposes_itself(monkeypatch):
+    """Its details are drawn at random, as those of the built-in effects are."""
+    module = importlib.import_module("hsnoise.criticism.diagnose")  # the package has the function of that name
+    monkeypatch.setattr(module, "built_in", lambda facts: {})
+    found = hsnoise.diagnose(CAMERA, COUNTS, candidates=[Proposing], draws=16, **CAPTURE)
+    (one,) = found.ranking
+    assert type(one.effect) is Proposing and one.name == "proposing"
+
+
+@pytest.mark.parametrize("call", ["diagnose", "improve"])
+@pytest.mark.parametrize(
+    ("attribute", "value", "error", "message"),
+    [
+        ("change", lambda signal: signal[:, 1:], ValueError, r"proposing: .* returned shape \(\d+, 31, 48\)"),
+        ("proposal", lambda size, rng: 3, TypeError, "expected proposing.propose to make proposing effects, got 3"),
+        ("name", "", ValueError, "name: expected that of an effect .* got ''"),
+    ],
+)
+def test_a_wrong_class_is_told_before_any_long_work(call, attribute, value, error, message, monkeypatch):
+    monkeypatch.setattr(Proposing, attribute, staticmethod(value) if callable(value) else value)
+    with pytest.raises(error, match=message):
+        CALLS[call](Proposing)
+
+
+@pytest.mark.parametrize(("attribute", "value"), [("proposal", None), ("least_frames", 5)])
+def test_a_class_that_the_capture_cannot_show_is_named(attribute, value, monkeypatch):
+    module = importlib.import_module("hsnoise.criticism.diagnose")
+    monkeypatch.setattr(module, "reference", lambda *of: pytest.skip("the warning comes before the draws"))
+    monkeypatch.setattr(Proposing, attribute, value)
+    with pytest.warns(UserWarning, match="candidates: proposing not tried: this capture cannot show it"):
+        with pytest.raises(pytest.skip.Exception):
+            CALLS["diagnose"](Proposing)
+
+
+def test_a_class_without_a_proposal_is_refused():
+    with pytest.raises(TypeError, match="instances, or classes with a propose; Mine is a class without one"):
+        hsnoise.diagnose(CAMERA, COUNTS, candidates=[Mine], **CAPTURE)
+    with pytest.raises(TypeError, match="candidates: expected a list of effects, got one effect, proposing"):
+        hsnoise.diagnose(CAMERA, COUNTS, candidates=Proposing, **CAPTURE)
+
+
+@pytest.mark.parametrize("candidate", ["row_noise", 3, int])
 def test_candidate_that_is_no_effect(candidate):
     with pytest.raises(TypeError, match="candidates: expected effects"):
         hsnoise.diagnose(CAMERA, COUNTS, candidates=[candidate], **CAPTURE)

@@ -11,7 +11,6 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import result_of
 from hsnoise.fitting.result import FitResult, Method, Status
-from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
@@ -55,8 +54,7 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
 
 
 def _gain_errors(result: FitResult) -> np.ndarray:
-    table = result.table
-    return np.array([table[number.name][1] for number in numbers_of(result.params, ["gain"])])
+    return np.array([error for _, error, _ in result.rows_of("gain").values()])
 
 
 def _errors(pixel: PixelFit) -> np.ndarray:

@@ -64,11 +64,10 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
 
 def _without_open_gain(result: FitResult) -> FitResult:
     """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
-    table, numbers = result.table, numbers_of(result.params)
-    gains = [table[number.name] for number in numbers if number.effect == "gain"]
+    gains = list(result.rows_of("gain").values())
     if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error, _ in gains):
         return result
-    names = tuple(number.name for number in numbers if in_electrons(number))
+    names = tuple(number.name for number in numbers_of(result.params) if in_electrons(number))
     return replace(result, withheld=tuple(dict.fromkeys((*result.withheld, *names))))
 
 
