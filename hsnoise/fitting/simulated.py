@@ -24,7 +24,6 @@ from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import FAR_OFF, share_of_far, shrunk_covariance
 from hsnoise.simulation.portion import Portion
-from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 8, 2, 32
@@ -79,18 +78,20 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Yardstick:
-    """Where statistics are measured from: `simulator`, their deviation [statistic] and inverse covariance in it."""
+    """What statistics are measured by: their deviation [statistic], and in it draws [draw, statistic] and weights."""
 
     problem: Problem
     simulator: Simulator
     deviation: np.ndarray
+    scatter: np.ndarray
     equal: np.ndarray
 
     @staticmethod
     def of(problem: Problem, simulator: Simulator, y: np.ndarray) -> _Yardstick:
         """From draws at y, whose numbers are none of those of the means."""
         found = simulator.reference(problem.at(y), SCATTER_DRAWS, SCATTER_FROM)
-        return _Yardstick(problem, simulator, found.deviation, np.linalg.inv(shrunk_covariance(_centred(found))))
+        scatter = (found.draws - found.mean) / found.deviation
+        return _Yardstick(problem, simulator, found.deviation, scatter, np.linalg.inv(shrunk_covariance(scatter)))
 
     def point(self, y: np.ndarray, count: int = MEAN_DRAWS) -> _Point:
         mean = self.simulator.draws(self.problem.at(y), count).mean(0)
@@ -110,11 +111,6 @@ class _Yardstick:
         return (mean * np.clip(1 - variance / np.maximum(mean**2, 1e-300), 0, 1) / self.deviation).T
 
 
-def _centred(found: Reference) -> np.ndarray:
-    """Draws less their mean, in deviations [draw, statistic]."""
-    return (found.draws - found.mean) / found.deviation
-
-
 def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
 
@@ -132,7 +128,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         gain = slopes.T @ weight
         information = gain @ slopes + np.diag(problem.prior)
         covariance = np.linalg.inv(information)
-        deviation = np.sqrt(np.diagonal(covariance))
+        deviation = np.sqrt(np.diagonal(as_scattered(covariance, gain, problem.prior, yard.scatter)))
         by = np.minimum(by, STEP_SIGMA * deviation)
         uphill = here.uphill(gain, problem)
         length = float(np.abs(covariance @ uphill / deviation).max())
@@ -146,7 +142,8 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         there = yard.point(ahead)
         before, after = here.cost(weight, problem), there.cost(weight, problem)
         if after < (1 + SLACK) * before + 1:
-            slopes = _updated(slopes, here, there)
+            if length >= SURE_STEP:  # what shorter ones do is mostly that rare counts change
+                slopes = _updated(slopes, here, there)
             wanted = length >= SURE_STEP and after > MUCH_LESS * before and taken < MOST_SLOPES
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
@@ -155,7 +152,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
     last = simulator.reference(problem.at(here.y), LAST_DRAWS)
     here = yard.point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
-    scattered = as_scattered(covariance, gain, (last.draws - last.mean) / yard.deviation)
+    scattered = as_scattered(covariance, gain, problem.prior, (last.draws - last.mean) / yard.deviation)
     return here.y + step * problem.share_of(step), scattered, length, iterations
 
 
