@@ -10,10 +10,10 @@ MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not
 def as_scattered(covariance: np.ndarray, gain: np.ndarray, prior: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Covariance [number, number] of estimates by linear weights, as draws show it: a sandwich.
 
-    The inverse information, `covariance`, holds where the weights are those of the statistics' own covariance, which few
-    draws do not give. gain [number, statistic] leads from statistics to the score; prior [number] are inverse variances
-    that hold numbers near the start, which is how far from it they may be; z are draws about their mean [draw,
-    statistic], other ones than the weights are from. The noise of the mean of as many draws is included.
+    The inverse information, `covariance`, is right for weights that are the statistics' own inverse covariance, which
+    few draws do not give. gain [number, statistic] leads from statistics to the score. prior [number]: inverse
+    variances that hold numbers near the start. z: draws about their mean [draw, statistic], other ones than the weights
+    are from. The noise of a mean of as many draws is included.
     """
     n = len(z)
     estimates = z @ (covariance @ gain).T

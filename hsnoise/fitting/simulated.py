@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.threads import in_threads
 from hsnoise._core.types import unit_in_words
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
 from hsnoise.fitting.notes import near_zero, parameter_notes
@@ -78,20 +79,27 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Yardstick:
-    """What statistics are measured by: their deviation [statistic], and in it draws [draw, statistic] and weights."""
+    """What statistics are measured by: their deviation [statistic], and in it draws [draw, statistic] and weights.
+
+    equal: weights [statistic, statistic] where none is far off, from all draws; halves: from either half of them.
+    """
 
     problem: Problem
     simulator: Simulator
     deviation: np.ndarray
     scatter: np.ndarray
     equal: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray]
 
     @staticmethod
     def of(problem: Problem, simulator: Simulator, y: np.ndarray) -> _Yardstick:
         """From draws at y, whose numbers are none of those of the means."""
         found = simulator.reference(problem.at(y), SCATTER_DRAWS, SCATTER_FROM)
         scatter = (found.draws - found.mean) / found.deviation
-        return _Yardstick(problem, simulator, found.deviation, scatter, np.linalg.inv(shrunk_covariance(scatter)))
+        equal, first, second = in_threads(
+            lambda some: np.linalg.inv(shrunk_covariance(some)), [scatter, scatter[::2], scatter[1::2]]
+        )
+        return _Yardstick(problem, simulator, found.deviation, scatter, equal, (first, second))
 
     def point(self, y: np.ndarray, count: int = MEAN_DRAWS) -> _Point:
         mean = self.simulator.draws(self.problem.at(y), count).mean(0)
@@ -101,6 +109,15 @@ class _Yardstick:
         """Weights [statistic, statistic], those of statistics that are far off made smaller."""
         share = share_of_far(point.off)
         return share[:, None] * self.equal * share
+
+    def errors(self, slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Standard errors of estimates [number]: half of the draws scatter by weights that are from the other half."""
+        found, prior = [], self.problem.prior
+        for equal, others in zip(self.halves, (self.scatter[1::2], self.scatter[::2]), strict=True):
+            gain = slopes.T @ (share[:, None] * equal * share)
+            covariance = np.linalg.inv(gain @ slopes + np.diag(prior))
+            found.append(np.diagonal(as_scattered(covariance, gain, prior, others - others.mean(0))))
+        return np.sqrt(np.mean(found, 0))
 
     def slopes(self, y: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Derivatives of the statistics at y [statistic, number], over `steps`."""
@@ -128,7 +145,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         gain = slopes.T @ weight
         information = gain @ slopes + np.diag(problem.prior)
         covariance = np.linalg.inv(information)
-        deviation = np.sqrt(np.diagonal(as_scattered(covariance, gain, problem.prior, yard.scatter)))
+        deviation = yard.errors(slopes, share_of_far(here.off))
         by = np.minimum(by, STEP_SIGMA * deviation)
         uphill = here.uphill(gain, problem)
         length = float(np.abs(covariance @ uphill / deviation).max())
