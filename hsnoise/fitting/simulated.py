@@ -33,6 +33,7 @@ SCATTER_DRAWS, SCATTER_FROM = (
     1000,
 )  # draws for the weights, whose numbers begin where those of the means do not reach
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
+SLOPE_NOISE = 8.0  # a slope of less than the root of it, in its standard errors, counts as zero
 SLACK, MUCH_LESS = (
     0.02,
     0.5,
@@ -123,9 +124,20 @@ class _Yardstick:
         """Derivatives of the statistics at y [statistic, number], over `steps`."""
         moved = [self.problem.at(y + steps * (np.arange(len(y)) == i)) for i in range(len(y))]
         slopes = self.simulator.slopes(self.problem.at(y), moved, steps, SLOPE_DRAWS)
-        mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / SLOPE_DRAWS
-        # The noise of hundreds of statistics that say nothing would pass for information, and make steps too short.
-        return (mean * np.clip(1 - variance / np.maximum(mean**2, 1e-300), 0, 1) / self.deviation).T
+        return (_without_noise(slopes / self.deviation)).T
+
+
+def _without_noise(slopes: np.ndarray) -> np.ndarray:
+    """Mean of slopes [draw, number, statistic], shrunk toward zero where draws differ.
+
+    The noise of hundreds of slopes that are zero would pass for information: estimates would stay near the start, and
+    their errors come out too small. The variance of so few draws is pooled: a factor for each number, one for each
+    statistic.
+    """
+    mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / len(slopes)
+    of_number = np.maximum(variance.mean(1, keepdims=True), 1e-300)
+    pooled = of_number * (variance / of_number).mean(0)
+    return mean * np.clip(1 - SLOPE_NOISE * pooled / np.maximum(mean**2, 1e-300), 0, 1)
 
 
 def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndarray, float, int]:
