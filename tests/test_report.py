@@ -17,7 +17,7 @@ from hsnoise.cli import demo as _demo
 from hsnoise.cli import results as _results
 from hsnoise.cli.main import main
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
-from hsnoise.criticism.diagnose import Unexplained
+from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.plots._groups import family_of, parts_of

@@ -12,7 +12,7 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise import report
 from hsnoise.criticism import Candidate, Comparison, Diagnosis, Step, Story
-from hsnoise.criticism.diagnose import Unexplained
+from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.plots._groups import FAMILIES

@@ -10,15 +10,12 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
-from hsnoise.fitting.simulated import (
-    LAST_DRAWS,
-    MOST_ITERATIONS,
-    SHORT_STEP,
-    Problem,
-    _search,
-    fit_synthetic,
-)
+from hsnoise.fitting.problem import Problem
+from hsnoise.fitting.simulated import LAST_DRAWS, MOST_ITERATIONS, SHORT_STEP, _search, fit_synthetic
 from hsnoise.likelihood.parameters import parameters_of
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Simulator
+from hsnoise.statistics.structure import Structure
 
 STATISTICS, NUMBERS = 60, 3
 SLOPES = np.random.default_rng(0).standard_normal((STATISTICS, NUMBERS))
@@ -68,7 +65,7 @@ def hidden():
 def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
     stack, base = hidden
     model = base.params.add(RowNoise(1.4))
-    problem = Problem(stack, base, model, ("row_noise",), 0, model)
+    problem = Problem(Portion.of(stack), base, model, ("row_noise",), model)
     # Parameters that are known to a few per cent, whatever coordinates stand for them.
     assert np.all(problem.prior[: len(base.names)] < 1e-3)
     steps = problem.slope(problem.centre)[:, None] * problem.whiten
@@ -79,7 +76,7 @@ def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
 def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
     stack, base = hidden
     assert abs(base.table["row_gain.sigma.B"][0] - 0.114) > 0.03  # the row noise passes for row gain
-    fit = fit_synthetic(base, stack, base.params.add(RowNoise(1.4)))
+    fit = fit_synthetic(base, Portion.of(stack), base.params.add(RowNoise(1.4)))
     for name, (value, _, _) in TRUTH.table.items():
         found, error, _ = fit.table[name]
         assert abs(found - value) <= 4 * error, f"{name}: {found} +- {error}, truth {value}"
@@ -123,23 +120,32 @@ def test_what_an_effect_holds_is_not_moved():
 class Bent:
     """A problem whose statistics are arcs of the first number: Newton's steps from far away lead further away."""
 
-    part, centre, other_start = None, np.zeros(0), None
+    centre, other_start = np.zeros(0), None
     start, truth, prior = np.array([2.5, 0.3]), np.array([0.2, -0.1]), np.full(2, 1e-6)
 
-    def draw(self, y, number):
-        noise = np.random.default_rng(number).standard_normal(40)
-        return 30 * np.repeat([np.arctan(y[0]), y[1]], 20) + noise, np.full(40, 0.3)
-
-    def statistics(self, part):
-        return self.draw(self.truth, 999)
+    def at(self, y):
+        return y
 
     def share_of(self, step):
         return 1.0
 
 
+class Arcs(Simulator):
+    """Draws of it: a model is y itself."""
+
+    def _draw(self, y, number):
+        noise = np.random.default_rng(number).standard_normal(40)
+        values = 30 * np.repeat([np.arctan(y[0]), y[1]], 20) + noise
+        return Structure(("",) * 40, ("",) * 40, values, np.full(40, 0.3), ())
+
+    @property
+    def measured(self):
+        return self._draw(Bent.truth, 999)
+
+
 def test_a_step_that_leads_away_is_taken_back():
     problem = Bent()
-    y, covariance, length, iterations = _search(problem, lambda: None)
+    y, covariance, length, iterations = _search(problem, Arcs(None, None, None))
     assert length < SHORT_STEP and iterations < MOST_ITERATIONS
     assert np.all(np.abs(y - problem.truth) < 4 * np.sqrt(np.diagonal(covariance)))
     assert np.all(np.sqrt(np.diagonal(covariance)) < 0.05)

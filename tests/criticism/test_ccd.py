@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise.fitting.simulated import Problem
+from hsnoise.fitting.problem import Problem
+from hsnoise.simulation.portion import Portion
 
 FRAMES, SHAPE, GAIN, BLACK_DN = 8, (200, 256), 1.8, 150
 
@@ -25,7 +26,7 @@ def test_what_bias_frames_know_keeps_its_digits_beside_what_they_do_not():
     """The read noise in DN is known to a part in a thousand, row gain and electrons not at all."""
     stack = bias_frames(0)
     base = hsnoise.fit(stack)
-    problem = Problem(stack, base, base.params, (), [], 0, base.params)
+    problem = Problem(Portion.of(stack), base, base.params, (), base.params)
     deviations = np.sqrt(problem.spread[0])
     assert np.all(np.isfinite(deviations)) and 3e-4 < deviations.min() < 1e-2
 

@@ -10,6 +10,7 @@ import pytest
 
 import hsnoise
 from hsnoise._core.events import Event
+from hsnoise.criticism import limit, rules
 from hsnoise.criticism.improve import _stage, _Work
 from hsnoise.criticism.outcomes import Ended, Ending
 from hsnoise.criticism.story import Step
@@ -19,14 +20,14 @@ improve = importlib.import_module("hsnoise.criticism.improve")
 
 def step(error: float) -> Step:
     fit = SimpleNamespace(params=hsnoise.cameras.grasshopper3())
-    return Step(fit, SimpleNamespace(error=error), None, None, float("nan"), ())
+    return Step(fit, SimpleNamespace(error=error, fits=error < rules.FITS), None, None, float("nan"), ())
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """Time, s, that passes when it is told to."""
     now = SimpleNamespace(s=1000.0)
-    monkeypatch.setattr(improve.time, "monotonic", lambda: now.s)
+    monkeypatch.setattr(limit.time, "monotonic", lambda: now.s)
     monkeypatch.setattr(_Work, "begun", lambda self, first: [step(26.34)])
     monkeypatch.setattr(improve, "fit", lambda *_, **__: None)
     return now
@@ -41,13 +42,13 @@ def stack(rng):
 def test_the_time_ends_a_diagnosis_at_the_next_draw(clock, stack, monkeypatch):
     drawn, said = [], []
 
-    def diagnose(*_, progress, **__):
+    def diagnosed(*_, tick, **__):
         for i in range(100):
             drawn.append(i)
             clock.s += 30
-            progress()
+            tick()
 
-    monkeypatch.setattr(improve, "diagnose", diagnose)
+    monkeypatch.setattr(improve, "diagnosed", diagnosed)
     story = hsnoise.improve(stack, max_minutes=2, progress=said.append)
     assert len(drawn) == 5  # the first draw beyond two minutes
     assert story.ended == "It stopped after 2 minutes; something may be left."
@@ -63,8 +64,9 @@ def test_the_time_ends_a_fit_at_the_next_draw(clock, stack, monkeypatch):
         clock.s += 121
         self.counter(Event("Step 1: adding row_noise"), 40)()
 
-    nearest, found = (SimpleNamespace(name="row_noise", score=99.0),), SimpleNamespace(headline="", advice="")
-    monkeypatch.setattr(improve, "diagnose", lambda *_, **__: found)
+    nearest = (SimpleNamespace(name="row_noise", score=99.0),)
+    found = SimpleNamespace(headline="", advice="", ranking=nearest)
+    monkeypatch.setattr(improve, "diagnosed", lambda *_, **__: found)
     monkeypatch.setattr(improve, "_nearest", lambda found: nearest)
     monkeypatch.setattr(_Work, "first_that_holds", first_that_holds)
     story = hsnoise.improve(stack, max_minutes=2)
@@ -73,12 +75,12 @@ def test_the_time_ends_a_fit_at_the_next_draw(clock, stack, monkeypatch):
 
 
 def test_without_a_limit_nothing_is_ended(clock, stack, monkeypatch):
-    def diagnose(*_, progress, **__):
+    def diagnosed(*_, tick, **__):
         clock.s += 1e9
-        progress()
+        tick()
         return SimpleNamespace(verdict="nothing missing", best=None, headline="", advice="")
 
-    monkeypatch.setattr(improve, "diagnose", diagnose)
+    monkeypatch.setattr(improve, "diagnosed", diagnosed)
     story = hsnoise.improve(stack)
     assert story.ending.why == Ended.WEAK_LEFT and "No effect stands out" in story.ended
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hsnoise import effects as fx
+from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
+from hsnoise.criticism.finding import Diagnosis, Unexplained
 from hsnoise.criticism.fingerprint import Fingerprint
-from hsnoise.criticism.gaussian import Gaussian, shrunk
 from hsnoise.criticism.nearest import nearest
 from hsnoise.criticism.ranking import (
-    EVIDENCE,
     GRID,
     Candidate,
     Evidence,
@@ -24,9 +23,8 @@ from hsnoise.criticism.ranking import (
     judge,
     limit_by_chance,
 )
-
-verdicts = importlib.import_module("hsnoise.criticism.diagnose")  # the package has a function of that name
-decide = verdicts._verdict
+from hsnoise.criticism.verdict import verdict_of
+from hsnoise.simulation.gaussian import Gaussian, shrunk
 
 STATISTICS, AMPLITUDES = 40, (0.35, 1.0, 2.5)
 NAMES = tuple(f"statistic {i}" for i in range(STATISTICS))
@@ -54,7 +52,7 @@ def evidence(*hidden: Fingerprint, amplitude: float = 0.8) -> Evidence:
 
 def test_a_named_effect_is_described_with_its_size_and_what_to_do_next():
     one = Candidate("periodic_banding", fx.PeriodicBanding(0.8, 0.2866), 930.0, 0.0, 1.2)
-    told = str(verdicts.Diagnosis((one,), "named", one, (one.name,), "", verdicts.Unexplained(1.2, "tails", ())))
+    told = str(Diagnosis((one,), "named", one, (one.name,), "", Unexplained(1.2, "tails", ())))
     for words in ("amplitude 0.8 e-, frequency 0.287 cycles/pixel, axis", "< 1e-9", "next: hsnoise improve"):
         assert words in " ".join(told.split())
 
@@ -115,11 +113,11 @@ def verdict(left: float, pair: Pair | None, worst: float = 20.0):
     ranking = [Candidate(name, fx.RowNoise(1.0), score, 1e-9, misfit) for name, score, misfit in rows]
     z = np.zeros(STATISTICS)
     z[:10] = (1 - 2 / 90 + worst * np.sqrt(2 / 90)) ** 1.5  # Wilson and Hilferty, of ten statistics
-    return decide(ranking, pair, replace(evidence(), z=z), laws(z, left, worst))
+    return verdict_of(ranking, pair, replace(evidence(), z=z), distributions(z, left, worst))
 
 
-def laws(z: np.ndarray, left: float, worst: float) -> dict[str, Gaussian]:
-    """The law with the first candidate takes so much of z away that `left` remains."""
+def distributions(z: np.ndarray, left: float, worst: float) -> dict[str, Gaussian]:
+    """The distribution with the first candidate takes so much of z away that `left` remains."""
     share = 1 - ((1 - 2 / 90 + left * np.sqrt(2 / 90)) / (1 - 2 / 90 + worst * np.sqrt(2 / 90))) ** 1.5
     return {"left": Gaussian(share * z, np.eye(STATISTICS))}
 
@@ -173,7 +171,7 @@ def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are()
     found = Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), NAMES, GROUPS, 2)
     judged = sorted((judge(of, found) for of in prints), key=lambda one: -one.score)
     ranking = [one.candidate(found) for one in judged]
-    assert [one.name for one in ranking] == ["wide", "left"]  # by normal laws, far from any of them
+    assert [one.name for one in ranking] == ["wide", "left"]  # by normal distributions, far from any of them
     no_base, ones = np.zeros((1, STATISTICS)), np.ones(STATISTICS)
     assert nearest(prints, ranking, found, no_base, ones)[0].name == "left"
     # What a wrong base parameter would do is no gain.
@@ -195,23 +193,31 @@ def test_what_takes_most_from_the_worst_group_is_tried_after_what_explains_most_
     assert without == ["many", "other"]  # neither takes half of what is off there
 
 
-def test_rare_statistics_that_go_with_others_leave_a_law():
+def test_rare_statistics_that_go_with_others_leave_a_distribution():
     """Counts of rare pixels hardly vary, and do so together with what the same pixels do elsewhere."""
     z = np.random.default_rng(12).standard_normal((64, STATISTICS))
     z[:, :19] = 0.45 * z[:, 20:21]
-    law = shrunk(z, np.zeros((1, STATISTICS)))
-    assert np.linalg.eigvalsh(law.covariance).min() > 0
-    assert np.all(np.diagonal(law.covariance)[:19] >= 1)
+    found = shrunk(z, np.zeros((1, STATISTICS)))
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
+    assert np.all(np.diagonal(found.covariance)[:19] >= 1)
 
 
 def test_the_limit_of_chance_is_exceeded_by_few_captures_without_an_effect():
-    """Laws estimated from few draws are too narrow, and their scores too high by chance: the limit rises with them."""
+    """Distributions from few draws are too narrow, and their scores too high by chance: the limit rises with them."""
     z = np.random.default_rng(11).standard_normal((4000, STATISTICS))
     limits = {}
     for deviation in (1.0, 0.6):
         null = Gaussian(np.zeros(STATISTICS), deviation**2 * np.eye(STATISTICS))
-        limits[deviation] = limit_by_chance(PRINTS, null, z[:64])
+        found = replace(evidence(), null=null)
+        limits[deviation] = limit_by_chance(PRINTS, found, z[:64])
         nothing = null.log_density(z)
-        best = np.max([of.law(float(a), null).log_density(z) for of in PRINTS for a in GRID], 0) - nothing
+        best = np.max([of.distribution(float(a), null).log_density(z) for of in PRINTS for a in GRID], 0) - nothing
         assert np.mean(best > limits[deviation]) < 0.01
-    assert limits[1.0] == EVIDENCE and limits[0.6] > EVIDENCE
+    assert limits[1.0] < rules.evidence(len(PRINTS), rules.CHANCE_RATE) < limits[0.6]  # Markov's bound
+
+
+def test_the_limit_is_that_of_chance_where_chance_gives_more_than_the_bound():
+    found = evidence()
+    assert found.limit == found.least == rules.evidence(len(PRINTS))
+    assert replace(found, chance=found.least - 1).limit == found.least
+    assert replace(found, chance=found.least + 1).limit == found.least + 1
