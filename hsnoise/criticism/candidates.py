@@ -6,23 +6,26 @@ to draw, so that an effect is recognised whatever they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
 from hsnoise._core.arguments import listed
+from hsnoise._core.types import cfa_tile
 from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
-from hsnoise.statistics.structure import code_step, moving_line, places
+from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
 LINE_DRAWS = 6  # without lines of their own
+TINY_ERROR = 1e-9  # of statistics of which only draws show how they scatter
 
 Suspect = AbstractEffect | type[AbstractEffect]  # what a user may offer
 
@@ -147,3 +150,36 @@ def not_in(model: NoiseModel, candidates: tuple[Suspect, ...]) -> tuple[Suspect,
         if effect.name in model:
             raise ValueError(f"candidates: {effect.name} is in the model already")
     return candidates
+
+
+def with_own_statistics(model: NoiseModel, candidates: Iterable[Suspect]) -> Callable[[FrameStack], Structure] | None:
+    """The statistics of a capture and those that effects of a user bring; None if none brings any.
+
+    A statistic is one of each dark exposure, in a group called after the effect.
+    """
+    own = [one for one in candidates if one.statistics.__func__ is not AbstractEffect.statistics.__func__]
+    black = black_level_of(model)[cfa_tile(model.cfa)]
+
+    def measure(stack: FrameStack) -> Structure:
+        found, added = structure(stack, black_level_of(model)), []
+        for i in (i for i, kind in enumerate(stack.kind) if kind == "dark"):
+            frames = np.stack(list(stack.frames(i))).astype(np.float32)
+            rows, columns = frames.shape[1] // len(black), frames.shape[2] // len(black)
+            above = frames - np.tile(black, (rows, columns))
+            for effect in own:
+                for what, value in effect.statistics(above).items():
+                    if not np.isfinite(value):
+                        raise ValueError(f"{effect.name}: expected finite statistics, {what} is {value}")
+                    added.append((effect.name, f"{effect.name}: {what}, {stack.exposure_s[i]:g} s, {i}", float(value)))
+        if not added:
+            return found
+        groups, names, values = zip(*added, strict=True)
+        return replace(
+            found,
+            names=(*found.names, *names),
+            groups=(*found.groups, *groups),
+            values=np.concatenate([found.values, values]),
+            error=np.concatenate([found.error, np.full(len(values), TINY_ERROR)]),
+        )
+
+    return measure if own else None

@@ -12,7 +12,6 @@ from hsnoise.effects import BlackClamp
 from hsnoise.fit import fit, without_likelihood
 from hsnoise.fitting.result import FitResult, Method
 from hsnoise.simulation.gaussian import Gaussian
-from hsnoise.simulation.simulator import Simulator
 
 CLAMP = BlackClamp.name
 DRAWS = 40
@@ -40,7 +39,7 @@ def clamp_by_likelihood(
     score = clamped.log_likelihood - fitted.log_likelihood - parameters
     if not score > 0 or not np.any(np.asarray(clamped.params[CLAMP].rate)):
         return None
-    simulator = Simulator(clamped.params, bench.simulator.portion, bench.simulator.key, bench.simulator.tick)
+    simulator = replace(bench.simulator, model=clamped.params, kept={})
     own = simulator.reference(clamped.params, DRAWS)
     z = own.z(simulator.measured.values)
     misfit = max(own.distribution.normal_scores(z, own.groups).values())

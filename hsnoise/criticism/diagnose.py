@@ -18,7 +18,15 @@ import numpy as np
 
 from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise.criticism import rules
-from hsnoise.criticism.candidates import Suspect, built_in, check_candidates, check_makers, facts_of, not_in
+from hsnoise.criticism.candidates import (
+    Suspect,
+    built_in,
+    check_candidates,
+    check_makers,
+    facts_of,
+    not_in,
+    with_own_statistics,
+)
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import WORST, Diagnosis
 from hsnoise.criticism.fingerprint import Bench
@@ -107,7 +115,8 @@ def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -
     log.info(
         "Drawing %d captures from the model, and each of %d candidates on top of it", draws, len(makers) + len(own)
     )
-    bench = Bench.of(Simulator(model, portion, key_for(seed, Purpose.DIAGNOSE), tick), draws)
+    measure = with_own_statistics(model, candidates)
+    bench = Bench.of(Simulator(model, portion, key_for(seed, Purpose.DIAGNOSE), tick, measure), draws)
     slopes, base = bench.slopes(), bench.base
     has_flats = "flat" in portion.frames.kind
     null = shrunk(base.own_z(), slopes)
@@ -165,8 +174,8 @@ def _scores(judged: Iterable[Judged]) -> str:
 
 def _limit(judged: list[Judged], draws: int, seed: int, search: Search) -> float:
     """Score that chance gives in hardly any capture like this one, from as many fresh draws of the model."""
-    used = search.bench.simulator
-    fresh = Simulator(used.model, used.portion, key_for(seed, Purpose.CHANCE), used.tick).draws(used.model, draws)
+    simulator = replace(search.bench.simulator, key=key_for(seed, Purpose.CHANCE), kept={})
+    fresh = simulator.draws(simulator.model, draws)
     return limit_by_chance([one.of for one in judged], search.evidence, search.bench.base.z(fresh))
 
 

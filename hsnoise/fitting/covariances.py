@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-DRAWS_OF_ALL = 10.0  # what all numbers say of the scatter of one counts as so many draws
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
-def as_scattered(covariance: np.ndarray, gain: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """`covariance` [number, number], widened if estimates from draws scatter more than weights without correlation say.
+def as_scattered(covariance: np.ndarray, gain: np.ndarray, prior: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Covariance [number, number] of estimates by linear weights, as draws show it: a sandwich.
 
-    gain [number, statistic] leads from statistics to the score; z are draws about their mean [draw, statistic].
+    The inverse information, `covariance`, is right for weights that are the statistics' own inverse covariance, which
+    few draws do not give. gain [number, statistic] leads from statistics to the score. prior [number]: inverse
+    variances that hold numbers near the start. z: draws about their mean [draw, statistic], other ones than the weights
+    are from. The noise of a mean of as many draws is included.
     """
-    estimates, known = z @ (covariance @ gain).T, len(z) - 1
-    ratio = (estimates**2).sum(0) / known / np.diagonal(covariance)
-    # Few draws: what they say of one number is averaged with what they say of all.
-    of_all = DRAWS_OF_ALL / (known + DRAWS_OF_ALL)
-    factor = np.sqrt(np.maximum((1 - of_all) * ratio + of_all * ratio.mean(), 1.0))
-    return covariance * factor[:, None] * factor[None, :]
+    n = len(z)
+    estimates = z @ (covariance @ gain).T
+    return estimates.T @ estimates * (1 + 1 / n) / (n - 1) + (covariance * prior) @ covariance
 
 
 def not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.threads import in_threads
 from hsnoise._core.types import unit_in_words
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
 from hsnoise.fitting.notes import near_zero, parameter_notes
@@ -24,7 +25,6 @@ from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import FAR_OFF, share_of_far, shrunk_covariance
 from hsnoise.simulation.portion import Portion
-from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 8, 2, 32
@@ -33,6 +33,7 @@ SCATTER_DRAWS, SCATTER_FROM = (
     1000,
 )  # draws for the weights, whose numbers begin where those of the means do not reach
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
+SLOPE_NOISE = 8.0  # a slope of less than the root of it, in its standard errors, counts as zero
 SLACK, MUCH_LESS = (
     0.02,
     0.5,
@@ -79,18 +80,27 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Yardstick:
-    """Where statistics are measured from: `simulator`, their deviation [statistic] and inverse covariance in it."""
+    """What statistics are measured by: their deviation [statistic], and in it draws [draw, statistic] and weights.
+
+    equal: weights [statistic, statistic] where none is far off, from all draws; halves: from either half of them.
+    """
 
     problem: Problem
     simulator: Simulator
     deviation: np.ndarray
+    scatter: np.ndarray
     equal: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray]
 
     @staticmethod
     def of(problem: Problem, simulator: Simulator, y: np.ndarray) -> _Yardstick:
         """From draws at y, whose numbers are none of those of the means."""
         found = simulator.reference(problem.at(y), SCATTER_DRAWS, SCATTER_FROM)
-        return _Yardstick(problem, simulator, found.deviation, np.linalg.inv(shrunk_covariance(_centred(found))))
+        scatter = (found.draws - found.mean) / found.deviation
+        equal, first, second = in_threads(
+            lambda some: np.linalg.inv(shrunk_covariance(some)), [scatter, scatter[::2], scatter[1::2]]
+        )
+        return _Yardstick(problem, simulator, found.deviation, scatter, equal, (first, second))
 
     def point(self, y: np.ndarray, count: int = MEAN_DRAWS) -> _Point:
         mean = self.simulator.draws(self.problem.at(y), count).mean(0)
@@ -101,18 +111,33 @@ class _Yardstick:
         share = share_of_far(point.off)
         return share[:, None] * self.equal * share
 
+    def errors(self, slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Standard errors of estimates [number]: half of the draws scatter by weights that are from the other half."""
+        found, prior = [], self.problem.prior
+        for equal, others in zip(self.halves, (self.scatter[1::2], self.scatter[::2]), strict=True):
+            gain = slopes.T @ (share[:, None] * equal * share)
+            covariance = np.linalg.inv(gain @ slopes + np.diag(prior))
+            found.append(np.diagonal(as_scattered(covariance, gain, prior, others - others.mean(0))))
+        return np.sqrt(np.mean(found, 0))
+
     def slopes(self, y: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Derivatives of the statistics at y [statistic, number], over `steps`."""
         moved = [self.problem.at(y + steps * (np.arange(len(y)) == i)) for i in range(len(y))]
         slopes = self.simulator.slopes(self.problem.at(y), moved, steps, SLOPE_DRAWS)
-        mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / SLOPE_DRAWS
-        # The noise of hundreds of statistics that say nothing would pass for information, and make steps too short.
-        return (mean * np.clip(1 - variance / np.maximum(mean**2, 1e-300), 0, 1) / self.deviation).T
+        return (_without_noise(slopes / self.deviation)).T
 
 
-def _centred(found: Reference) -> np.ndarray:
-    """Draws less their mean, in deviations [draw, statistic]."""
-    return (found.draws - found.mean) / found.deviation
+def _without_noise(slopes: np.ndarray) -> np.ndarray:
+    """Mean of slopes [draw, number, statistic], shrunk toward zero where draws differ.
+
+    The noise of hundreds of slopes that are zero would pass for information: estimates would stay near the start, and
+    their errors come out too small. The variance of so few draws is pooled: a factor for each number, one for each
+    statistic.
+    """
+    mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / len(slopes)
+    of_number = np.maximum(variance.mean(1, keepdims=True), 1e-300)
+    pooled = of_number * (variance / of_number).mean(0)
+    return mean * np.clip(1 - SLOPE_NOISE * pooled / np.maximum(mean**2, 1e-300), 0, 1)
 
 
 def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndarray, float, int]:
@@ -132,7 +157,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         gain = slopes.T @ weight
         information = gain @ slopes + np.diag(problem.prior)
         covariance = np.linalg.inv(information)
-        deviation = np.sqrt(np.diagonal(covariance))
+        deviation = yard.errors(slopes, share_of_far(here.off))
         by = np.minimum(by, STEP_SIGMA * deviation)
         uphill = here.uphill(gain, problem)
         length = float(np.abs(covariance @ uphill / deviation).max())
@@ -146,7 +171,8 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         there = yard.point(ahead)
         before, after = here.cost(weight, problem), there.cost(weight, problem)
         if after < (1 + SLACK) * before + 1:
-            slopes = _updated(slopes, here, there)
+            if length >= SURE_STEP:  # what shorter ones do is mostly that rare counts change
+                slopes = _updated(slopes, here, there)
             wanted = length >= SURE_STEP and after > MUCH_LESS * before and taken < MOST_SLOPES
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
@@ -155,7 +181,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
     last = simulator.reference(problem.at(here.y), LAST_DRAWS)
     here = yard.point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
-    scattered = as_scattered(covariance, gain, (last.draws - last.mean) / yard.deviation)
+    scattered = as_scattered(covariance, gain, problem.prior, (last.draws - last.mean) / yard.deviation)
     return here.y + step * problem.share_of(step), scattered, length, iterations
 
 

@@ -50,6 +50,7 @@ class Simulator:
         key: of all draws; see `key_for`.
         tick: called after each draw.
         measure: statistics of a capture; by default those of its structure.
+        kept: what was drawn, by model and number.
     """
 
     model: NoiseModel
@@ -57,7 +58,7 @@ class Simulator:
     key: RandomKey
     tick: Callable[[], None] = lambda: None
     measure: Callable[[FrameStack], Structure] | None = None
-    _kept: dict[tuple, Structure] = field(default_factory=dict)
+    kept: dict[tuple, Structure] = field(default_factory=dict)
 
     @cached_property
     def measured(self) -> Structure:
@@ -89,10 +90,10 @@ class Simulator:
 
     def _all(self, wanted: Sequence[tuple[NoiseModel, int]]) -> list[Structure]:
         names = [(_identity(model), number) for model, number in wanted]
-        new = {name: task for name, task in zip(names, wanted, strict=True) if name not in self._kept}
+        new = {name: task for name, task in zip(names, wanted, strict=True) if name not in self.kept}
         found = in_threads(lambda task: self._draw(*task), new.values(), self.tick)
-        self._kept.update(zip(new, found, strict=True))
-        return [self._kept[name] for name in names]
+        self.kept.update(zip(new, found, strict=True))
+        return [self.kept[name] for name in names]
 
     def _draw(self, model: NoiseModel, number: int) -> Structure:
         return self._statistics(draw_capture(jax.random.fold_in(self.key, number), model, self.portion.frames))

@@ -1,0 +1,101 @@
+"""Are the errors of refits by simulation right? Pulls and coverage over simulated captures with an effect each.
+
+    python -m benchmarks.refits --captures 20
+    python -m benchmarks.refits --effects row_noise,hot_pixels --out build/refits.jsonl
+
+Captures are drawn by hsnoise itself, small ones, so that a hundred take an hour. Standard errors are tested, not
+physics. A pull is (estimate - truth) / standard error; its root mean square should be 1, and 95 % lie within 1.96.
+Finished captures are lines of `--out`, and are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import zlib
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import hsnoise
+from hsnoise import effects as fx
+
+EFFECTS = {
+    "row_noise": fx.RowNoise(1.0),
+    "column_noise": fx.ColumnNoise(0.8),
+    "frame_offset": fx.FrameOffset(0.4),
+    "dark_signal_nonuniformity": fx.DarkSignalNonuniformity(1.5),
+    "crosstalk": fx.Crosstalk(0.02),
+}
+EXPOSURE_S, FRAMES, SHAPE = (0.02, 0.05, 0.1, 0.2), 6, (64, 96)
+WITHIN = 1.96
+
+
+def pulls(name: str, number: int) -> dict[str, float]:
+    """Pull of each number of the refit of capture `number`."""
+    camera = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    truth = camera.add(EFFECTS[name])
+    key = jax.random.key(zlib.crc32(f"{name} {number}".encode()))
+    counts = [
+        np.asarray(hsnoise.sample_dark(jax.random.fold_in(key, i), FRAMES, SHAPE, truth, exposure_s=t, sensor_key=key))
+        for i, t in enumerate(EXPOSURE_S)
+    ]
+    stack = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=64, white_level=65535, cfa="RGGB", shutter="global")
+    fit = hsnoise.fit(stack, model=truth, pixels="alike")
+    return {
+        parameter: (value - truth.table[parameter][0]) / error
+        for parameter, (value, error, _) in fit.table.items()
+        if parameter in fit.names and np.isfinite(error)
+    }
+
+
+def read(out: Path) -> dict[tuple[str, int], dict[str, float]]:
+    """Finished captures of the file."""
+    lines = map(json.loads, out.read_text().splitlines()) if out.exists() else ()
+    return {(one["effect"], one["number"]): one["pulls"] for one in lines}
+
+
+def report(found: dict[tuple[str, int], dict[str, float]]) -> Table:
+    """Root mean square and coverage by effect: of the base parameters and of the effect's own."""
+    table = Table("effect", "captures", "base: rms pull", "within 1.96", "own: rms pull", "within 1.96 ")
+    for name in EFFECTS:
+        some = [one for (effect, _), one in found.items() if effect == name]
+        own = np.array([p for one in some for parameter, p in one.items() if parameter.split(".")[0] == name])
+        base = np.array([p for one in some for parameter, p in one.items() if parameter.split(".")[0] != name])
+        if some:
+            table.add_row(name, f"{len(some)}", *_in_words(base), *_in_words(own))
+    return table
+
+
+def _in_words(values: np.ndarray) -> tuple[str, str]:
+    return f"{np.sqrt(np.mean(values**2)):.2f}", f"{100 * np.mean(np.abs(values) < WITHIN):.0f} %"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=int, default=20, help="of each effect (default 20)")
+    parser.add_argument("--effects", default=",".join(EFFECTS))
+    parser.add_argument("--minutes", type=float, default=np.inf, help="start no new capture after this time")
+    parser.add_argument("--out", type=Path, default=Path("build/refits.jsonl"))
+    arguments = parser.parse_args()
+    end = time.monotonic() + 60 * arguments.minutes
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    found = read(arguments.out)
+    wanted = [(name, number) for number in range(arguments.captures) for name in arguments.effects.split(",")]
+    with arguments.out.open("a") as file:
+        for name, number in track([one for one in wanted if one not in found], console=Console(stderr=True)):
+            if time.monotonic() > end:
+                break
+            found[name, number] = pulls(name, number)
+            file.write(json.dumps({"effect": name, "number": number, "pulls": found[name, number]}) + "\n")
+            file.flush()
+    Console(width=110).print(report(found))
+
+
+if __name__ == "__main__":
+    main()
