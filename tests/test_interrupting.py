@@ -102,7 +102,7 @@ def test_while_python_code_and_threads_run():
 import threading, time
 from concurrent.futures import ThreadPoolExecutor
 import hsnoise
-from hsnoise import _interrupting
+from hsnoise._core import interrupting as _interrupting
 _interrupting.on_disk("the model so far is in out/model.json")
 with ThreadPoolExecutor() as pool:
     pool.submit(lambda: time.sleep(600))
@@ -123,7 +123,7 @@ def test_a_half_written_file_is_removed_and_the_old_one_stays(tmp_path):
     path.write_text("old")
     code = f"""
 import os, time
-from hsnoise import _output
+from hsnoise._core import output as _output
 def slow(_):
     print("ready", file=sys.stderr, flush=True)
     time.sleep(600)
@@ -149,7 +149,7 @@ def interrupted_when_ready(code: str) -> tuple[int, str]:
 def test_work_that_keeps_what_it_has_is_given_the_exception():
     code = """
 import time
-from hsnoise import _interrupting
+from hsnoise._core import interrupting as _interrupting
 with _interrupting.as_exception():
     try:
         print("ready", file=sys.stderr, flush=True)
@@ -164,7 +164,7 @@ with _interrupting.as_exception():
 def test_after_the_work_it_changes_nothing():
     code = """
 import time
-from hsnoise.cli import main
+from hsnoise.cli.main import main
 status = main([])
 print("ready", file=sys.stderr, flush=True)
 time.sleep(2)
@@ -176,7 +176,7 @@ sys.exit(status)
 def test_other_processes_are_left_as_they_are():
     code = """
 import signal, threading
-import hsnoise, hsnoise.cli
+import hsnoise, hsnoise.cli.main
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 assert signal.set_wakeup_fd(-1) == -1
 assert threading.active_count() == 1

@@ -26,7 +26,7 @@ darks = hsnoise.sample_dark(0, 4, (64, 64), hsnoise.cameras.grasshopper3(), expo
 print(hsnoise.fit(da.from_array(np.asarray(darks)[None], chunks=(1, 1, 64, 64)), exposure_s=[0.1], cfa="RGGB"))
 """,
     "video": """
-import hsnoise.cli, numpy as np
+import hsnoise.cli.main, numpy as np
 np.savez("clip.npz", frames=np.full((2, 32, 32, 3), 128, np.uint8))
 assert hsnoise.cli.main(["sample", "canon_5d3", "--shape", "64x64", "--out", "raw.npz"]) == 0
 assert hsnoise.cli.main(["enhance", "raw.npz", "bright.mp4", "--camera", "canon_5d3"]) == 0
