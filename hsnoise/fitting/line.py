@@ -40,7 +40,7 @@ class LineFit:
 
 
 class _Points(NamedTuple):
-    """Statistics of the rows of each exposure, flats behind darks: [replicate, channel, point].
+    """Statistics of the rows of each exposure, flats after darks: [replicate, channel, point].
 
     level (DN), variance within rows, power of row means about their frame's mean (DN^2); the numbers of pixels and
     rows they stand on. bands [replicate, channel, dark, band]: the power of the darks by row frequency.
