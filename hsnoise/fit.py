@@ -36,14 +36,14 @@ from hsnoise.statistics.pixels.survey import Survey, survey
 log = logging.getLogger(__name__)
 
 OUTLIERS_FROM = 1e-4
-PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, that tell whether pixels differ
-SMALLEST = 8  # rows and columns; fewer tell nothing of rows
+PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, to test whether pixels differ
+SMALLEST = 8  # rows and columns; fewer say nothing about rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
-    "{} lies at a step of the likelihood, where the rows whose gain the model clips at 0 are rounded to the next count:"
-    " it is known to half a count only. Such rows are a sign of an effect that the model lacks: hsnoise.compare tells."
+    "{} lies at a step of the likelihood, where rows whose gain the model clips at 0 are rounded to the next count: it"
+    " is known only to half a count. Such rows suggest that the model lacks an effect: run hsnoise.compare."
 )
 
 
@@ -63,23 +63,23 @@ def fit(
 ) -> FitResult:
     """Estimate all parameters of the paper's noise model jointly.
 
-    Where single pixels differ in what they hold in the dark, as those of real sensors do, the fit is conditional on
-    the pixel (`hsnoise.pixel_fit`), and their population becomes effects of the model; else pixels of a row are pooled
-    in the exact likelihood. A test on the frames decides.
+    If pixels differ in the dark, as in real sensors, the fit is conditional on the pixel (`hsnoise.pixel_fit`), and
+    their population becomes effects of the model. Otherwise the pixels of a row are pooled in the exact likelihood. A
+    test on the frames decides.
 
     Args:
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack, or a `Summary` of one; or
             with FrameStack's keywords (exposure_s, black_level, white_level, cfa, shutter, kind, ...) an array
             [frame, row, column] or [exposure, frame, row, column], or a list of arrays [frame, row, column], one an
             exposure.
-        model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`; its values are
-            not used, but for `row_gain.white_share`: 0 and 1 are held, and any other is where the search for it starts.
+        model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`. Its values are not
+            used, except `row_gain.white_share`: 0 and 1 are held, and any other value is where its search starts.
             Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
             statistics, together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "transfer" pixel
-            transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", which the result then
-            says. With effects beyond the paper's it is that of the fit which the simulated statistics start from.
-        pixels: "alike" pools the pixels whatever they are, "differ" never does, "auto" tests it.
+            transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", as the result then
+            states. With effects beyond the paper's it is the method of the fit before the simulation.
+        pixels: "alike" always pools the pixels, "differ" never does, "auto" tests whether they differ.
         progress: called with no argument after each frame that has been read.
 
     Returns:
@@ -119,7 +119,7 @@ def fit(
         return _ended(_pooled(summary, model, method))
     seen = Evidence(found, summary)
     if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
-        log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they tell no gain")
+        log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they show no gain")
         return _ended(checked(result_of(measure(_all_of(source, found), summary), summary, model, source), seen))
     result = replace(_pooled(summary, model, method), stack=source)
     return _ended(checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen))
@@ -132,7 +132,7 @@ def _ended(result: FitResult) -> FitResult:
 
 
 def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResult:
-    """The exact likelihood, or the line fit, of pixels that are all alike."""
+    """The exact likelihood, or the line fit, with the pixels of a row pooled."""
     with_row_gain = model is None or "row_gain" in model
     with_clamp = model is not None and "black_clamp" in model
     if with_clamp:
@@ -142,7 +142,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         raise ValueError("method: the line fit has no row_gain.white_share, which the model has; use ml")
     if not summary.histograms and summary.black_level_dn is None:
         raise ValueError(
-            f"{named('black_level')}: flats alone do not tell the black level from read noise; give"
+            f"{named('black_level')}: flats alone cannot separate the black level from read noise; give"
             f" {named('black_level')} or add dark frames"
         )
     with jax.enable_x64(True):
@@ -156,7 +156,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
         if method == "line":
             return _by_line(summary, model, Status.LINE)
         log.info("Maximising the likelihood of rows, pixels pooled")
-        # Without a component for them, pixels that follow no law of this model may lead the fit to one without meaning.
+        # Pixels that do not follow this model could make the fit meaningless unless they have their own component.
         outside = far_outliers(summary)
         result, converged = _by_likelihood(summary, model, start, _set_apart(outside))
         if (outside <= OUTLIERS_FROM).all():
@@ -171,7 +171,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
 
 
 def _with_judged_flats(summary: Summary, start: NoiseModel) -> Summary:
-    """The curve of the flats' variance and what each level weighs come before the likelihood, which is given both."""
+    """The summary with the curve of the flats' variance and the levels' weights, which the likelihood needs."""
     if summary.flats is None:
         return summary
     return replace(summary, flats=judged(summary.flats, flat_gain_of(start, summary.flats)))
@@ -197,12 +197,12 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
 
 
 def rechecked(result: FitResult, stack) -> FitResult:
-    """The result with the doubts of its own model, instead of those of the fit that it went on from."""
+    """The result with the doubts of its own model, instead of those of the fit that it started from."""
     return checked(result, Evidence(_surveyed(stack), result.summary))
 
 
 def _surveyed(stack) -> Survey:
-    """A survey of the stack, or where it is large of a part: enough to tell whether pixels differ."""
+    """A survey of the stack, or of part of a large one: enough to see whether pixels differ."""
     _check_size(stack)
     rows, columns = stack.shape
     frames = slice(0, PROBE_FRAMES)
@@ -214,7 +214,7 @@ def _surveyed(stack) -> Survey:
 
 
 def _all_of(stack, found: Survey) -> Survey:
-    """The survey of the whole stack, that of the part if that is all."""
+    """The survey of the whole stack; `found` if that already covers it."""
     whole = found.shape == stack.shape and max(stack.n_frames) <= PROBE_FRAMES
     return found if whole else survey(stack)
 
@@ -255,14 +255,14 @@ def _check_copies(summary: Summary) -> None:
 
 
 def _check_complete(model: NoiseModel) -> None:
-    """Raise ValueError for a model without the effects that every fit has."""
+    """Raise ValueError for a model without the effects that every fit needs."""
     missing = [name for name in ("shot_noise", "read_noise", "gain", "adc") if name not in model]
     if missing:
         raise ValueError(f"{named('model')}: has no {', '.join(missing)}, without which it cannot be fitted")
 
 
 def _white_share(model: NoiseModel | None) -> np.ndarray | None:
-    """That of a model's row gain; None for 0."""
+    """The white share of a model's row gain; None for 0."""
     if model is None or "row_gain" not in model:
         return None
     share = np.asarray(model["row_gain"].white_share, np.float64)
@@ -271,11 +271,9 @@ def _white_share(model: NoiseModel | None) -> np.ndarray | None:
 
 def _check_clamp(summary: Summary, method: str) -> None:
     if method == "line":
-        raise ValueError("method: the line fit takes the means for the dark signal, which black_clamp hides; use ml")
+        raise ValueError("method: the line fit gets the dark signal from means, where black_clamp hides it; use ml")
     if not summary.histograms or np.ptp(summary.exposure_s) == 0:
-        raise ValueError(
-            f"{named('model')}: black_clamp shows in darks of two or more exposures only, which this stack has not"
-        )
+        raise ValueError(f"{named('model')}: black_clamp needs darks of two or more exposures, which this stack lacks")
 
 
 def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tuple[FitResult, bool]:
@@ -311,16 +309,16 @@ def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tupl
 
 
 def _edges(covariance: np.ndarray, coordinates: Coordinates, found: NoiseModel, summary: Summary) -> np.ndarray:
-    """Which parameters are black levels that seem better known than the mean of all pixels tells them [parameter].
+    """Which parameters are black levels that seem better known than the mean of all pixels allows [parameter].
 
-    Rows whose gain the model clips at 0 put all their pixels on one count, and the likelihood jumps where the black
-    level would be rounded to another: close to such a step its curvature says nothing of the error.
+    Rows whose gain the model clips at 0 have all their pixels on one count, and the likelihood jumps where the black
+    level would be rounded to another count. Near such a step its curvature says nothing about the error.
     """
     edges = np.zeros(len(coordinates.numbers), bool)
     for i in np.flatnonzero(coordinates.where("black_level")):
         (c,) = coordinates.numbers[i].index
         noise_dn = float(found["gain"].value[c] * found["read_noise"].sigma)
-        if noise_dn > EDGE_DN:  # finer noise does tell where the steps are
+        if noise_dn > EDGE_DN:  # smaller noise does show where the steps are
             pixels = summary.histograms[c].row_pixels.sum()
             edges[i] = np.sqrt(covariance[i, i]) < 0.3 * noise_dn / np.sqrt(pixels)
     return edges
@@ -331,7 +329,7 @@ def _of_hidden_dark_level(
 ) -> np.ndarray:
     """Covariance of black levels from a dark current within its error of 0.
 
-    What of the mean is black and what is dark signal is open there, and curvature, at the floor, does not see it.
+    Black level and dark signal cannot be separated there, and the curvature at the bound does not show it.
     """
     deviation, moved = np.sqrt(np.diagonal(covariance)), np.zeros(len(covariance))
     blacks, gains = coordinates.where("black_level"), coordinates.where("gain")
@@ -370,6 +368,6 @@ def _covariance(information: np.ndarray) -> np.ndarray:
 
 
 def _fitted(found: NoiseModel, model: NoiseModel | None, exposure_s: float) -> NoiseModel:
-    """What was found of the effects that are wanted (None: of all)."""
+    """The fitted values of the effects in `model` (None: all)."""
     wanted = [found[name] for name in (found.names if model is None else model.names)]
     return within_bounds(NoiseModel(wanted, cfa=found.cfa, shutter=found.shutter, exposure_s=exposure_s))

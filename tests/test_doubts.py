@@ -41,11 +41,11 @@ def test_a_right_fit_raises_no_doubt(good):
 @pytest.mark.parametrize(
     ("where", "value", "says"),
     [
-        (lambda p: p["read_noise"].sigma, 6.0, "noise of the pixels"),
-        (lambda p: p["gain"].value, 3.0, "noise of the pixels"),
+        (lambda p: p["read_noise"].sigma, 6.0, "pixel noise"),
+        (lambda p: p["gain"].value, 3.0, "pixel noise"),
         (lambda p: p["black_level"].value, 130.0, "level of the typical pixel"),
         (lambda p: p["dark_current"].rate, 200.0, "does not grow with exposure"),
-        (lambda p: p["row_gain"].sigma, 0.2, "shares in a frame"),
+        (lambda p: p["row_gain"].sigma, 0.2, "row noise within frames"),
     ],
 )
 def test_a_parameter_that_is_wrong_is_seen_in_the_drawn_frames(good, where, value, says):
@@ -58,7 +58,7 @@ def test_a_parameter_that_is_wrong_is_seen_in_the_drawn_frames(good, where, valu
 
 def test_a_white_level_below_the_counts_is_named():
     fit = hsnoise.fit(pixels_that_differ(), exposure_s=EXPOSURES_S, white_level=400)
-    assert any("above the white level" in doubt for doubt in fit.doubts), fit.doubts
+    assert any("above the given white level" in doubt for doubt in fit.doubts), fit.doubts
     assert not fit.trustworthy
 
 
@@ -66,7 +66,7 @@ def test_a_white_level_below_the_counts_is_named():
 def test_counts_that_end_below_the_white_level_are_named(given):
     counts = pixels_that_differ(exposures=(0.1, 0.4, 6.4), ends_at=1500)
     fit = hsnoise.fit(counts, exposure_s=(0.1, 0.4, 6.4), white_level=given)
-    assert any("end at a count of 1500" in doubt for doubt in fit.doubts), fit.doubts
+    assert any("saturate at 1500 DN" in doubt for doubt in fit.doubts), fit.doubts
 
 
 def test_the_right_white_level_is_no_doubt():
@@ -90,7 +90,7 @@ def test_rows_that_go_on_contradict_a_global_shutter(coloured, shutter, doubted)
     rows = np.stack([rows[..., k : k + SHAPE[0]] for k in range(8)]).mean(0) * 8**0.5 if coloured else rows[..., 7:]
     counts = np.round(counts + 2.0 * rows[..., None]).astype(np.uint16)
     fit = hsnoise.fit(counts, exposure_s=EXPOSURES_S, shutter=shutter)
-    assert any("goes on in the next row" in doubt for doubt in fit.doubts) == doubted, fit.doubts
+    assert any("continues in the next row" in doubt for doubt in fit.doubts) == doubted, fit.doubts
 
 
 def test_frames_that_were_smoothed_are_named(good):

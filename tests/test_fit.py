@@ -225,7 +225,7 @@ def test_hot_pixels_are_set_apart_and_told(rng):
 
     result = hsnoise.fit(capture(model, change=add))
     assert_recovered(result, model, sigmas=6)
-    assert any("follow no law of this model" in note for note in result.notes)
+    assert any("do not follow this model" in note for note in result.notes)
 
 
 def test_frames_that_saw_light_are_called_flats():
@@ -334,7 +334,7 @@ def test_a_large_capture_that_hardly_tells_the_gain_is_fitted(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("share", "words"), [(0.05, None), (0.2, "gain.R is known to 20% only"), (0.4, "not determined")]
+    ("share", "words"), [(0.05, None), (0.2, "gain.R is known only to 20%"), (0.4, "not determined")]
 )
 def test_a_gain_that_is_weakly_known_asks_for_flats(canon_fit, share, words):
     _, result = canon_fit

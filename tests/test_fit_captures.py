@@ -78,7 +78,7 @@ def test_a_few_pixels_are_refused():
 
 @pytest.mark.parametrize(
     ("means", "exposure_s", "words"),
-    [((400, 400), (0.1, 0.4), "pass kind='flat'"), ((10, 30), (0.1, 0.1), "All exposures are said to be 0.1 s")],
+    [((400, 400), (0.1, 0.4), "pass kind='flat'"), ((10, 30), (0.1, 0.1), "All exposures are given as 0.1 s")],
 )
 def test_what_cannot_be_darks_is_told(means, exposure_s, words):
     rng = np.random.default_rng(0)

@@ -195,4 +195,4 @@ def test_the_gain_of_real_flats(shared_data, name, low, high):
     assert found.standard_error[0] < 0.08 * found.gain[0]
     notes = " ".join(gain_notes(found, moments, ("mono",)))
     if name == "site_2k_ccd":
-        assert "The black level falls with the signal" in notes and "bends down or falls" in notes
+        assert "The black level falls with the signal" in notes and "near saturation" in notes

@@ -1,4 +1,4 @@
-"""Pixels that follow no law of the model must not lead a fit astray: a saturated percent, and a thousandth."""
+"""Pixels that do not follow the model must not lead a fit astray: a saturated percent, and a thousandth."""
 
 from __future__ import annotations
 
@@ -46,4 +46,4 @@ def test_saturated_pixels_leave_the_parameters_alone(share):
     clean = hsnoise.fit(capture(0.0))
     for name in ("gain.G", "read_noise.sigma"):  # not half a standard error from where they would be
         assert abs(result.table[name][0] - clean.table[name][0]) < 0.5 * clean.table[name][1]
-    assert any("follow no law of this model" in note for note in result.notes)
+    assert any("do not follow this model" in note for note in result.notes)

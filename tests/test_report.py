@@ -160,7 +160,7 @@ def test_a_page_says_what_was_found(pages, compared):
     said = {command: Elements(page).text for command, page in pages.items()}
     worst = max(compared.groups, key=compared.groups.__getitem__)
     error = _context.number(compared.error)
-    assert f"most of all in {worst}: error {error}, 1.0 would be" in said["compare"]
+    assert f"{worst} is worst: error {error}, 1.0 would be" in said["compare"]
     assert f"Missing: row_noise. Error {error}, 1.0 would be as close" in said["diagnose"]
     assert "Fits Added row_noise, and the error fell from 88.1 to 1.1. Nothing significant is left" in said["improve"]
     assert "gain.R moved from 3.1 to 3.5 DN/e-." in said["improve"] and "+80.0 nats" in said["improve"]
@@ -181,10 +181,10 @@ def test_text_of_users_is_escaped(pages):
     ("found", "said", "light"),
     [
         (comparison(), "The model describes these frames: error 1.1", "green"),
-        (comparison(5.0, 0.11), "The model comes close to these frames, but fails most of all in row x fr", "amber"),
+        (comparison(5.0, 0.11), "The model comes close to these frames, but does not fit; row x frame is", "amber"),
         (
             comparison(50.0, 0.11),
-            "The model does not describe these frames, most of all in row x frame: error 50",
+            "The model does not describe these frames; row x frame is worst: error 50",
             "red",
         ),
         (diagnosis("nothing missing", ()), "Nothing significant is missing.", "green"),
@@ -381,7 +381,7 @@ def test_a_story_says_what_is_open(story):
     first, last = story.steps
     unmet = replace(last.fit, status=Status.NOT_MET)
     told = str(replace(story, steps=(first, replace(last, ahead=2.0, fit=unmet))))
-    assert "row_noise fits as well on the other side of the gain" in told
+    assert "row_noise fits equally well on the other side of the gain" in told
     assert "the last fit has NOT CONVERGED" in told
     assert "other side" not in str(replace(story, steps=(first, replace(last, ahead=20.0))))
     assert "NOT CONVERGED" not in str(story)

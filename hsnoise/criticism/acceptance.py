@@ -1,4 +1,4 @@
-"""Whether a step of `improve` is kept: it must fit better, on frames that no fit has seen too, and be beyond chance."""
+"""Whether a step of `improve` is kept: it must fit better, also on held-out frames, and be beyond chance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hsnoise.fitting.result import FitResult
 
 
 def why_worse(step: Step, before: Step) -> Refusal | None:
-    """In which way statistics, or frames that no fit has seen, fit worse with what was added; None if they do not."""
+    """In which way statistics or held-out frames fit worse with the added effect; None if they do not."""
     # Held-out frames are the last ones: effects that change from frame to frame are drawn as if they were the first.
     unseen = not (np.isnan(step.held_out) or any(effect.in_series for effect in step.fit.params))
     after, until_now = step.comparison, before.comparison
@@ -22,7 +22,7 @@ def why_worse(step: Step, before: Step) -> Refusal | None:
         return Refusal(Refused.NOT_CONVERGED, *errors)
     allowed = rules.WORSE
     if after.error > until_now.error:
-        # The worst group may be that of another effect, which is still missing and does not stand quite still.
+        # The worst group may belong to another effect that is still missing, and may vary a little.
         less = sum(after.groups.values()) < rules.TOTAL_FALLS * sum(until_now.groups.values())
         if not less or after.error > rules.GROWTH * until_now.error:
             return Refusal(Refused.STATISTICS_WORSE, *errors)
@@ -33,10 +33,10 @@ def why_worse(step: Step, before: Step) -> Refusal | None:
 
 
 def is_there(effect: AbstractEffect, result: FitResult) -> bool:
-    """Whether some amplitude of the effect is beyond chance in a fit with it; one that fits hold, whether it is set.
+    """Whether some amplitude of the effect is beyond chance in a fit with it; if fits hold it, whether it is set.
 
-    Of an effect that marks none, numbers that may be 0 and have no upper bound count, or else those of either sign, or
-    shares.
+    For an effect that marks no amplitude, parameters with lower bound 0 and no upper bound count, or else those of
+    either sign, or shares.
     """
     found = effect.parameters(result.params.channels)
     kinds = (
@@ -53,7 +53,7 @@ def is_there(effect: AbstractEffect, result: FitResult) -> bool:
 
 
 def is_too_little(nearest: tuple[Candidate, ...], steps: list[Step]) -> bool:
-    """Whether a further effect is too weak, beside those that were chosen from the same frames, where all fits."""
+    """Whether a further effect is too weak, given that the model fits and others were chosen from the same frames."""
     last = steps[-1]
     late = rules.evidence(len(last.diagnosis.ranking), rules.LATER_RATE)
     return len(steps) > 1 and last.comparison.fits and nearest[0].score < late

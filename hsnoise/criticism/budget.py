@@ -82,7 +82,7 @@ class NoiseBudget:
         rows: one for each exposure and colour, in the order of the stack.
         growth: (colour, component) to slope and standard error over the dark exposures, DN^2/s.
         pixels: (colour, what) to how it differs between pixels: "offset", "dark signal", "temporal noise".
-        flags: colour to the share of pixels that are stuck, dead, hot, telegraph-like (NaN: not told).
+        flags: colour to the share of pixels that are stuck, dead, hot, telegraph-like (NaN: unknown).
         survey: what the pass over the pixels kept.
         stack: the frames, for `under`.
     """
@@ -147,7 +147,7 @@ class NoiseBudget:
 def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
     """Split the counts of each exposure and colour into the components of the three-dimensional noise decomposition.
 
-    One pass over the frames, one in memory at a time; what is told of single pixels comes from evenly spread rows of
+    One pass over the frames, one in memory at a time; statistics of single pixels come from evenly spread rows of
     sensors above 2 Mpixel, or 1 Mpixel where there are more than two exposures.
 
     Args:
@@ -157,11 +157,11 @@ def budget(stack: Any, *, progress=None, **keywords) -> NoiseBudget:
         progress: called with no argument after each frame.
 
     Returns:
-        NoiseBudget: `print` it for the table; variances are unbiased and may be below 0 where there is none. Of an
-        exposure of one frame all are NaN: what stays and what changes cannot be told apart.
+        NoiseBudget: `print` it for the table; variances are unbiased and may be below 0 where there is none. For
+        an exposure of one frame all are NaN: static and temporal parts cannot be separated.
 
     Raises:
-        FileNotFoundError, TypeError, ValueError: whatever `load` or `FrameStack` refuse.
+        FileNotFoundError, TypeError, ValueError: what `load` or `FrameStack` refuse.
 
     Reference: D'Agostino and Webb, SPIE 1488, 1991.
     """

@@ -43,7 +43,7 @@ def printed(budget: Any) -> str:
 
 
 def as_html(budget: Any) -> str:
-    """The same tables for a notebook, of shares first: they tell at a glance what matters."""
+    """The same tables for a notebook, of shares first: they show at a glance what matters."""
     pixels = [_html.paragraph(ABOUT_PIXELS), _html.printed(spreads(budget))] if budget.pixels else []
     return _html.fragment(
         _html.paragraph("Noise budget: shares of the total variance in per cent; σ is the root of the total"),

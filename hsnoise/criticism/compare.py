@@ -27,7 +27,7 @@ from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import explained
 
 DRAWS = 40
-WORST = 5  # statistics told in words
+WORST = 5  # statistics described in words
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 log = logging.getLogger(__name__)
 
 DRAWS = 64
-FEW = 2  # effects that a fit put in, of which one alone may be all that there is
-LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # what a clamp looks like from a fit that does not know of it
+FEW = 2  # effects that a fit added, of which one alone may explain everything
+LIKE_A_CLAMP = {CLAMP, "nonlinearity"}  # names under which a clamp appears if the fit has none
 
 
 def diagnose(
@@ -55,9 +55,9 @@ def diagnose(
 ) -> Diagnosis:
     """Name the physical effect that a fitted model lacks.
 
-    A fit where pixels differ has put in by itself what it measured of them, of rows, columns and frames. If one of
-    these effects explains all that the paper's model lacks, it is the one that is named; else the whole model is asked
-    what it lacks still.
+    A fit of differing pixels adds the effects that it measured on pixels, rows, columns and frames. If one of these
+    alone explains all that the paper's model lacks, it is named; otherwise the diagnosis looks for what the whole model
+    still lacks.
 
     Args:
         fit: result of `hsnoise.fit` on this capture, or one like it (a NoiseModel is taken, too).
@@ -164,7 +164,7 @@ def _found(search: Search, fit, draws: int, seed: int) -> tuple[Diagnosis, list[
 
 
 def _leaves_something(first: Judged, evidence: Evidence) -> bool:
-    """Whether the first candidate is there, and does not explain all."""
+    """Whether the first candidate is present but does not explain everything."""
     return first.score > evidence.least and first.misfit > rules.MISFIT_LEFT
 
 
@@ -173,7 +173,7 @@ def _scores(judged: Iterable[Judged]) -> str:
 
 
 def _limit(judged: list[Judged], draws: int, seed: int, search: Search) -> float:
-    """Score that chance gives in hardly any capture like this one, from as many fresh draws of the model."""
+    """Score that chance hardly ever exceeds in such a capture, from as many fresh draws of the model."""
     simulator = replace(search.bench.simulator, key=key_for(seed, Purpose.CHANCE), kept={})
     fresh = simulator.draws(simulator.model, draws)
     return limit_by_chance([one.of for one in judged], search.evidence, search.bench.base.z(fresh))

@@ -61,13 +61,13 @@ def improve(
 ) -> Story:
     """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
 
-    Where no effect explains all that is missing, as in most real sensors, the one that comes nearest is added and the
-    story goes on; it is told as finished only if nothing significant is left.
+    If no effect explains all that is missing, as in most real sensors, the nearest one is added and the story goes on.
+    It counts as finished only if nothing significant is left.
 
     Args:
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
             FrameStack's keywords.
-        model: where to start, the model of a story that was broken off, say; default: all effects of the paper.
+        model: where to start, such as the model of an interrupted story; default: all effects of the paper.
         candidates: effects of your own that may be added, too, classes or instances as `diagnose` takes them.
         max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
             fit is finished in any case); None: as long as it takes.
@@ -105,7 +105,7 @@ def improved(
     keep=None,
     **keywords,
 ) -> Story:
-    """`improve`, telling what is being done as events instead of sentences."""
+    """`improve`, reporting progress as events instead of sentences."""
     keep, seed = callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
     darks = Portion.of(stack).darks.frames
@@ -136,7 +136,7 @@ def improved(
 class _Work:
     """What every step is made of.
 
-    fitted: frames to fit, and their portion that is drawn; held_out: frames that no fit sees; tell: is told of events.
+    fitted: frames to fit, and the portion of them that is drawn; held_out: frames that no fit sees; tell: gets events.
     """
 
     fitted: FrameStack
@@ -147,7 +147,7 @@ class _Work:
     limit: Limit = NO_LIMIT
 
     def say(self, event: Event) -> None:
-        """Tell of a stage, and log it."""
+        """Report a stage, and log it."""
         log.info("%s", event)
         self.tell(event)
 
@@ -213,7 +213,7 @@ class _Work:
         return None, refused
 
     def refusal(self, effect: AbstractEffect, step: Step, before: Step) -> Refusal | None:
-        """Why the step with the effect is not kept; None if it is."""
+        """Why the step with the effect is rejected; None if it is kept."""
         worse = why_worse(step, before)
         if worse is not None:
             return worse
@@ -222,7 +222,7 @@ class _Work:
         return None if self.needs(effect.name, step) else Refusal(Refused.NO_CHANGE)
 
     def needs(self, name: str, step: Step) -> bool:
-        """Whether some group fits worse without the effect: if not, what helped was that the others were refitted."""
+        """Whether some group fits worse without the effect; if none does, only refitting the others helped."""
         without = compared(step.fit.params.remove(name), self.portion, seed=self.seed).groups
         return any(
             without[g] - misfit > rules.NEEDED * max(misfit, 1.0) for g, misfit in step.comparison.groups.items()
@@ -231,7 +231,7 @@ class _Work:
     def with_one_more(self, steps: list[Step], candidate: Candidate) -> Step | None:
         """The model with the candidate, on the side of the gain where it fits better; None if it cannot be fitted.
 
-        `diagnose` judges the side from a base fit that the effect has bent.
+        `diagnose` judges the side from a base fit that the effect has biased.
         """
         fits: list[FitResult] = []
         for effect in _sides(candidate.effect):
@@ -252,7 +252,7 @@ class _Work:
 
 
 def _stage(what: str, steps: Sequence[Step]) -> Event:
-    """What is being done for the step after `steps`, and what became of the error until now."""
+    """What is being done for the step after `steps`, and how the error has changed so far."""
     errors = sentences.errors_so_far([step.comparison.error for step in steps])
     return Event(f"Step {len(steps)}: {what}", errors)
 
@@ -269,7 +269,7 @@ def _check_start(model: NoiseModel | None, candidates: tuple[Suspect, ...], port
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
-    """What to try: the effect that is named, or else those that explain most of what none explains alone."""
+    """What to try: the effect that is named, or else the nearest ones."""
     if found.best is not None:
         alike = [one for one in found.ranking if one.name in found.names]
         return tuple(alike) if found.verdict == Verdict.AMBIGUOUS else (found.best,)
@@ -290,7 +290,7 @@ def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
 def _fit_with(
     effect: AbstractEffect, steps: list[Step], fitted: FrameStack, portion: Portion, tick: Callable[[], None]
 ) -> FitResult:
-    """A fit of the last model and one effect more; it goes on from the last fit by likelihood if that holds."""
+    """A fit of the last model and one effect more; it starts from the last fit by likelihood if possible."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != Method.SYNTHETIC), None)
     if base is None or any(one.in_likelihood and one.name not in base.params for one in model):

@@ -1,4 +1,4 @@
-"""When `improve` ends whatever is left."""
+"""When `improve` stops, even if something is left."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TimeIsUp(Exception):
 
 @dataclass(frozen=True)
 class Limit:
-    """When the loop ends whatever is left: the time, s, and the number of additions."""
+    """When the loop stops, even if something is left: the time, s, and the number of additions."""
 
     began_s: float
     minutes: float
@@ -27,7 +27,7 @@ class Limit:
 
     @staticmethod
     def of(max_minutes: float | None, max_steps: int | None) -> Limit:
-        """Raises ValueError for limits that are none."""
+        """Raises ValueError for invalid limits."""
         minutes = np.inf if max_minutes is None else float(max_minutes)
         if not minutes > 0:
             raise ValueError(f"max_minutes: expected minutes above 0, got {max_minutes}")

@@ -1,7 +1,7 @@
 """Which effects come nearest where none explains a capture: those that explain most of its statistics.
 
-Far off, the likelihood ratio of normal distributions goes to whatever makes statistics scatter most. By Student's t
-instead, statistics that others will have to explain count alike however far off they are (Lange, Little, Taylor,
+If no effect fits, the likelihood ratio of normal distributions favours the effect that scatters statistics most. With
+Student's t, statistics left for other effects count equally however far off they are (Lange, Little, Taylor,
 "Robust statistical modeling using the t distribution", J. Am. Stat. Assoc. 84, 1989).
 """
 

@@ -64,7 +64,7 @@ class Evidence:
 
     @property
     def limit(self) -> float:
-        """Log-likelihood ratio, nats, from which one of them is there, what chance gives in such a capture included."""
+        """Log-likelihood ratio, nats, from which one of them is present, allowing for chance in such a capture."""
         return max(self.least, self.chance)
 
     @cached_property

@@ -62,9 +62,9 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
 def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple[float, AbstractEffect]:
     """Log-likelihood ratio of an effect, and the effect, with its parameters and the base brought close to the capture.
 
-    Unlike fingerprints on a base that the effect has bent, it tells variants of one effect that differ little. It is
-    no evidence that there is the effect at all: nothing of the base is held against it. Slopes are those where the
-    search starts: what the base does to the statistics hardly depends on the effect.
+    Unlike fingerprints on a base that the effect has biased, it separates variants of one effect that differ little. It
+    is no evidence for the effect itself, because the base is free. Slopes are taken where the search starts: the
+    influence of the base on the statistics hardly depends on the effect.
     """
     own = bench.base.distribution.covariance
     model = bench.model.add(effect)

@@ -1,7 +1,7 @@
-"""Every threshold of the loop, with its reason; `python -m benchmarks.rules` derives those again that can be derived.
+"""Every threshold of the loop, with its reason; `python -m benchmarks.rules` derives again those that can be derived.
 
-What stands here decides what is said of a model. How many captures are drawn on the way is effort, and stands where
-they are drawn.
+These numbers decide the verdict on a model. Numbers of draws are a matter of effort, and are defined where the draws
+are made.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The candidates, looked at ever more closely: a glance at all, many draws of those that lead, pairs of them."""
+"""The candidates, examined ever more closely: a glance at all, many draws of the leaders, then pairs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Search:
         return judge_all(prints, self.evidence)
 
     def likely(self, judged: list[Judged]) -> list[Judged]:
-        """Candidates, the likely ones judged by more draws, and whoever comes first then; best first."""
+        """Candidates, with the likely ones and the resulting first judged by more draws; best first."""
         enough = LIKELY * judged[0].score
         some = [one for i, one in enumerate(judged[:MOST_LIKELY]) if i < LEAST_LIKELY or one.score > enough]
         return self.first_known(self.with_more_draws(some, judged))
@@ -71,7 +71,7 @@ class Search:
         return self.first_known(self.with_more_draws([one for one in judged if one.of.name in names], judged))
 
     def first_known(self, judged: list[Judged]) -> list[Judged]:
-        """Candidates, the first of them not by a glance alone."""
+        """Candidates, the first of them judged by more than a glance."""
         while judged[0].of.amplitudes == GLANCE:
             judged = self.with_more_draws(judged[:1], judged)
         return judged

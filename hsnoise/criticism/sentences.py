@@ -12,15 +12,15 @@ from hsnoise.effects import AbstractEffect
 from hsnoise.fitting.result import number, rounded
 
 LEGEND = (
-    "score: log-likelihood ratio of this effect alone against nothing missing (what resembles the missing one scores,"
-    " too: the first is meant); z left: how far off the worst group of statistics is with it in the model, in"
-    " deviations of a normal distribution (below 3.5 is chance); p: chance of such a score if nothing is missing"
+    "score: log-likelihood ratio of this effect alone against nothing missing (similar effects score, too: the first"
+    " is the one named); z left: how far off the worst group of statistics is with the effect in the model, in normal"
+    " standard deviations (below 3.5 is chance); p: probability of this score if nothing is missing"
 )
 ENDED_IN_SHORT = {
     Ended.FINISHED: "Nothing significant is left",
     Ended.WEAK_LEFT: "No effect stands out, but something weak may be left",
-    Ended.AS_CHANCE: "Nothing more could be added, and the error is as chance gives",
-    Ended.NOT_HELD: "Still {headline}, but no refit with it held",
+    Ended.AS_CHANCE: "Nothing more could be added, and the error is within chance",
+    Ended.NOT_HELD: "Still {headline}, but no refit with it was kept",
     Ended.UNEXPLAINED: "Something is left that no effect of the library explains",
     Ended.MINUTES: "It stopped after {limit}; something may be left",
     Ended.STEPS: "It stopped after {limit}; something may be left",
@@ -33,7 +33,7 @@ REFUSED = {
     Refused.STATISTICS_WORSE: "statistics fit worse with it (error {went})",
     Refused.HELD_OUT_WORSE: "held-out frames fit worse with it, by {less:.1f} nats",
     Refused.ZERO: "came out compatible with zero",
-    Refused.NO_CHANGE: "changed nothing by itself",
+    Refused.NO_CHANGE: "made no difference by itself",
 }
 
 
@@ -41,38 +41,38 @@ REFUSED = {
 
 
 def describes(error: float) -> str:
-    """That a model fits."""
-    return f"The model describes these frames: error {number(error)}, where 1.0 is as close as its own samples."
+    """The sentence for a model that fits."""
+    return f"The model describes these frames: error {number(error)} (1.0: as close as its own samples)."
 
 
 def fails(error: float, worst: str, is_close: bool) -> str:
-    """That a model does not fit, and in which group of statistics."""
-    how = "comes close to these frames, but fails" if is_close else "does not describe these frames,"
+    """The sentence for a model that does not fit, with the worst group of statistics."""
+    how = "comes close to these frames, but does not fit" if is_close else "does not describe these frames"
     close = "1.0 would be as close as its own samples"
-    return f"The model {how} most of all in {worst}: error {number(error)}, {close}."
+    return f"The model {how}; {worst} is worst: error {number(error)}, {close}."
 
 
 def measure(error: float, misfit: float, own: float) -> str:
-    """What the error is: a misfit over the model's own."""
+    """What the error is: a misfit divided by the model's own."""
     return (
-        f"error {error:.2f} (1.0: like the model's own samples): the worst misfit below, {misfit:.2f}, over that of the"
-        f" model's own samples, {own:.2f}"
+        f"error {error:.2f} (1.0: like the model's own samples): the worst misfit below, {misfit:.2f}, divided by that"
+        f" of the model's own samples, {own:.2f}"
     )
 
 
 def columns_compared(first: int, last: int, columns: int) -> str:
-    """What of large frames was looked at."""
+    """Which columns of large frames were compared."""
     return f"only columns {first} to {last} of {columns} were compared: the frames are large"
 
 
 def off(name: str, measured: float, model: float, z: float) -> str:
-    """A statistic that the model fails to give."""
+    """A statistic that the model gets wrong."""
     return f"{name}: measured {measured:.3g}, the model gives {model:.3g} ({_deviations(z)})"
 
 
 def brought_nearer(name: str, measured: float, model: float, z: float, now: float) -> str:
-    """A statistic that another model gives better; model, now: what the one before and this one give."""
-    return f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with it {now:.3g}"
+    """A statistic that a new model gives better; model, now: its values under the old model and the new one."""
+    return f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with the effect {now:.3g}"
 
 
 def _deviations(z: float) -> str:
@@ -105,24 +105,23 @@ def first_estimate(effect: AbstractEffect) -> str:
         value = " ".join(f"{x:.3g}" for x in np.asarray(getattr(effect, field)).ravel())
         values.append(f"{field} {value} {unit_in_words(spec.unit)}".rstrip())
     values += [f"{name} {value}" for name, value in effect.settings().items() if value is not None]
-    return f"{effect.name}: {effect.about()} First estimate (a fit gives it with its error): {', '.join(values)}."
+    return f"{effect.name}: {effect.about()} First estimate (a fit adds its error): {', '.join(values)}."
 
 
 def open_side(effect: AbstractEffect) -> str:
-    """That the side of the gain is a guess; empty for an effect that has but one."""
+    """A note that the side of the gain is a guess; empty for an effect with only one side."""
     if not has_sides(effect):
         return ""
     return (
         f"whether {effect.name} arises before or after the gain is a first guess: improve fits both and keeps the"
-        " likelier"
+        " likelier side"
     )
 
 
 def come_nearest(names: Iterable[str]) -> str:
-    """The effects that explain most of what none explains."""
-    return (
-        f"most statistics would be explained, though none of them whole, by (improve tries these): {', '.join(names)}"
-    )
+    """The effects that come nearest where none explains everything."""
+    nearest = ", ".join(names)
+    return f"these effects would explain the most statistics, but none explains all (improve tries them): {nearest}"
 
 
 def next_call(of_users: bool) -> str:
@@ -141,9 +140,9 @@ def still_off(names: Iterable[str], group: str, misfit: float, statistics: Itera
 
 def partly_explained(names: Iterable[str], blamed: str, left: str) -> str:
     """Advice where effects explain a part; blamed, left: the worst groups of statistics without and with them."""
-    beside = "what is left of them" if left == blamed else f"the {left} statistics that are left"
+    rest = "the rest" if left == blamed else f"the remaining misfit in the {left} statistics"
     by = f"{' and '.join(names)} would explain part of the {blamed} statistics"
-    return f"{by}; no effect in the library explains {beside}"
+    return f"{by}; no effect in the library explains {rest}"
 
 
 def not_explained(blamed: str) -> str:
@@ -153,14 +152,14 @@ def not_explained(blamed: str) -> str:
 
 def more_frames(names: Sequence[str]) -> str:
     """Advice where two effects look alike."""
-    return f"more frames would tell {names[0]} from {names[1]}"
+    return f"more frames would distinguish {names[0]} from {names[1]}"
 
 
 # Stories
 
 
 def errors_so_far(errors: Sequence[float]) -> str:
-    """What became of the error until now; empty before the first."""
+    """How the error has changed so far; empty before the first fit."""
     ends = dict.fromkeys(number(errors[i]) for i in (0, -1)) if errors else ()
     return f"error {' -> '.join(ends)}" if ends else ""
 
@@ -178,40 +177,40 @@ def ended_in_short(ending: Ending, missing: str) -> str:
 
 
 def ended(ending: Ending, error: float, missing: str, advice: str) -> str:
-    """How a story ended, whole: with the error of the last model, what would be next, and what was tried."""
+    """How a story ended, in full: with the error of the last model, what would be next, and what was tried."""
     short, of_error = ended_in_short(ending, missing), f"(error {error:.2f})"
     match ending.why:
         case Ended.UNFINISHED:
-            said = f"{short}: whether something is missing was being looked for."
+            said = f"{short}: the last diagnosis is still running."
         case Ended.MINUTES | Ended.STEPS:
             said = f"{short}."
         case Ended.WEAK_LEFT:
             said = f"{short}: the error is {error:.2f}."
         case Ended.AS_CHANCE:
-            said = f"Nothing more could be added, and the error is {error:.2f}, as chance gives."
+            said = f"Nothing more could be added, and the error is {error:.2f}, within chance."
         case Ended.UNEXPLAINED:
             said = f"{short} {of_error}: {advice}." if advice else f"{short} {of_error}."
         case _:
             said = f"{short} {of_error}{_following(ending)}."
     tried = "; ".join(f"{name} {refusal(why)}" for name, why in ending.refused.items())
-    return f"{said} What was tried is left out: {tried}." if tried else said
+    return f"{said} Tried and rejected: {tried}." if tried else said
 
 
 def _following(ending: Ending) -> str:
     if ending.following is None:
         return ""
     name, score = ending.following
-    return f": {name} would be next, by {score:.0f} nats, as chance gives among so many"
+    return f": {name} would be next, with {score:.0f} nats, within chance among so many candidates"
 
 
 def added_in_short(names: Iterable[str], first: float, last: float) -> str:
-    """What was added, and what became of the error."""
+    """What was added, and how the error changed."""
     how = "fell" if last < first else "went"
     return f"Added {', '.join(names)}, and the error {how} from {number(first)} to {number(last)}."
 
 
 def sizes(rows: Mapping[str, tuple[float, float, str]], effect: AbstractEffect, sides_open: bool) -> tuple[str, ...]:
-    """What was fitted of an effect, its rows of a table, and what was chosen; whether its side of the gain is open."""
+    """The fitted parameters of an effect, its settings, and whether its side of the gain is still open."""
     said = []
     for label, (value, error, unit) in rows.items():
         size, of = rounded(value, error)
@@ -221,7 +220,7 @@ def sizes(rows: Mapping[str, tuple[float, float, str]], effect: AbstractEffect, 
     said += [f"{effect.name}.{field}: {value}." for field, value in chosen if value is not None]
     if sides_open:
         said.append(
-            f"{effect.name} fits as well on the other side of the gain: these frames do not tell which it is on."
+            f"{effect.name} fits equally well on the other side of the gain: these frames do not determine the side."
         )
     return tuple(said)
 
@@ -232,35 +231,35 @@ def moved(name: str, old: tuple[float, float], new: tuple[float, float], unit: s
 
 
 def fell_together(before: float, after: float) -> str:
-    """What fell where the error did not; before, after: misfits of all groups together."""
-    return f", misfit of all groups together {number(before)} -> {number(after)}"
+    """The total misfit, for steps where it fell but the error did not; before, after: of all groups together."""
+    return f", total misfit of all groups {number(before)} -> {number(after)}"
 
 
 def because(nearer: Sequence[str], score: float, is_nearest: bool) -> str:
-    """Why an effect was added: the statistics that it brought nearer, or else its score, nats.
+    """Why an effect was added: the statistics that it improved, or else its score, nats.
 
-    is_nearest: whether no effect explains all that was off.
+    is_nearest: whether no effect explains everything that was off.
     """
     reason = nearer[0] if nearer else f"its fingerprint is in the statistics (score {score:.0f} nats)"
-    return f"{reason} (no effect explains all that is off; this one comes nearest)" if is_nearest else reason
+    return f"{reason} (no effect explains everything; this one comes nearest)" if is_nearest else reason
 
 
 def added(step: int, name: str, reason: str, before: float, after: float, fell: str) -> str:
-    """Why a step was taken, and what became of the error; fell: what fell beside it."""
+    """Why a step was taken, and how the error changed; fell: what else fell."""
     return f"Step {step}: added {name}, because {reason}; error {before:.2f} -> {after:.2f}{fell}."
 
 
 def with_care(outcome: str) -> str:
-    """What to mind of a fit that did not converge."""
-    return f"Read its numbers with care, the last fit has {outcome}."
+    """A warning about a fit that did not converge."""
+    return f"Treat its numbers with caution: the last fit has {outcome}."
 
 
 def frames_apart(fitted: Sequence[int], held_out: Sequence[int]) -> str:
     """Which frames were fitted and which held out; fitted, held_out: dark frames of each exposure."""
     return (
-        f"Fitted and compared were the first {_span(fitted)} dark frames of each exposure; held-out: the log-likelihood"
-        f" of the statistics of the other {_span(held_out)}, in nats (one more: 2.7 times as probable). To fit all of"
-        " them: hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
+        f"The first {_span(fitted)} dark frames of each exposure were fitted and compared. held-out: log-likelihood of"
+        f" the statistics of the other {_span(held_out)}, in nats (one more: 2.7 times as probable). To fit all frames:"
+        " hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
     )
 
 

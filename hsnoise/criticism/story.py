@@ -89,7 +89,7 @@ class Story:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Whether the last model may be used, and what became of the error."""
+        """Whether the last model can be used, and how the error changed."""
         error, last = self.errors[-1], self.fit.conclusion
         if last.light == Light.RED or error >= rules.CLOSE:
             light = Light.RED
@@ -139,7 +139,7 @@ class Story:
 
     @property
     def care(self) -> str:
-        """What to mind of the last fit; empty if it converged."""
+        """A warning about the last fit; empty if it converged."""
         return "" if self.fit.converged else sentences.with_care(self.fit.outcome)
 
     def plot(self):

@@ -1,6 +1,6 @@
-"""Physical effects, one a file, and the one list of those built in.
+"""Physical effects, one per file, and the list of the built-in ones.
 
-May import `_core` alone; two effects never see each other.
+May import only `_core`; effects never import each other.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What an effect is: physical parameters and one method that draws what happens in the sensor.
 
-An effect of one's own is a class of about 20 lines in one's own file:
+An effect of your own is a class of about 20 lines in your own file:
 
     class RowOffset(AbstractEffect):
         name = "row_offset"
@@ -50,7 +50,7 @@ PIXELS = "pixels"  # the random key of electrons and read noise, which share the
 
 
 class Stage(enum.IntEnum):
-    """Where in the sensor an effect acts: a model runs effects in this order, then in that of insertion."""
+    """Where in the sensor an effect acts: a model runs effects by stage, then in the order of insertion."""
 
     LIGHT = 0  # changes the expected photoelectrons, e-
     PHOTONS = 1  # draws the photoelectrons
@@ -64,7 +64,7 @@ class Stage(enum.IntEnum):
 
 
 class Capture(eqx.Module):
-    """How the frames were taken: what an effect may know besides the signal.
+    """How the frames were taken: what an effect can use besides the signal.
 
     Attributes:
         exposure_s: exposure in seconds, scalar.
@@ -75,9 +75,9 @@ class Capture(eqx.Module):
         gain: system gain [channel], DN/e-; None if the model has none.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
         dark_current_scale: factor on the dark current of each pixel, as above.
-        differentiable: whether counts are floats with a derivative, which passes rounding as if it were not there.
+        differentiable: whether counts are floats with a derivative, which ignores rounding.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
-        moved: rows and columns by which they lie further down and to the right than that; None for 0.
+        moved: rows and columns by which the frames lie below and to the right of `window`; None for 0.
     """
 
     exposure_s: Scalar
@@ -112,29 +112,29 @@ class Capture(eqx.Module):
         return self.shape if self.window is None else self.window[2:]
 
     def rounded(self, signal: Frames) -> Frames:
-        """The nearest whole numbers; their derivative is that of the signal if it is wanted."""
+        """The nearest whole numbers, with the derivative of the signal if it is wanted."""
         whole = jnp.round(signal)
         return signal + jax.lax.stop_gradient(whole - signal) if self.differentiable else whole
 
     def offset(self, electrons: jax.Array, after_gain: bool) -> jax.Array:
-        """An offset in the unit of the signal: e-, or behind the gain DN, as many as the electrons give on average."""
+        """An offset in the unit of the signal: e-, or after the gain DN, converted from electrons by the mean gain."""
         if not after_gain or self.gain is None:
             return electrons
         return electrons * jnp.mean(self.gain[cfa_tile(self.cfa).ravel()])
 
     def fixed_key(self, name: str) -> RandomKey:
-        """The key from which the effect called `name` draws what never changes on this sensor."""
+        """The key from which the effect called `name` draws its fixed patterns on this sensor."""
         return named_key(self.sensor_key, name)
 
     def offset_variance(self, variance_e2: float, after_gain: bool = False) -> float:
-        """What an offset of this variance, e-^2, adds to the variance of counts, DN^2: the mean over all pixels."""
+        """Mean variance over all pixels, DN^2, that an offset of this variance, e-^2, adds to the counts."""
         if self.gain is None:
             return float(variance_e2)
         gain = np.asarray(self.gain, float)[cfa_tile(self.cfa)]
         return float(variance_e2 * (gain.mean() ** 2 if after_gain else (gain**2).mean()))
 
     def spread_of_lines(self, axis: int, power: np.ndarray | jax.Array) -> tuple[float, float]:
-        """How a stationary series over the rows (axis 0) or columns (1) of a frame divides between its components.
+        """How the variance of a stationary series over rows (axis 0) or columns (1) divides between components.
 
         The shares of its variance in the lines and in the frame as a whole, as the three-dimensional decomposition of
         one colour estimates them: (1, 0) of white noise; the second is negative where the series has no mean.
@@ -172,9 +172,9 @@ class Capture(eqx.Module):
 class AbstractEffect(eqx.Module):
     """One physical effect. Subclasses are final: give `name`, `stage`, parameters by `param`, and `sample`.
 
-    What is not a physical parameter (a clipping level, a choice) is an `eqx.field(static=True)` that JSON can
-    hold. What else it may say about itself: how strong it may be (`propose`), what variance it adds (`components`), a
-    number in which it shows (`statistics`).
+    Settings that are not physical parameters (a clipping level, a choice) are `eqx.field(static=True)` values that JSON
+    can hold. Optionally an effect says how strong it may be (`propose`), what variance it adds (`components`), and in
+    which numbers it shows (`statistics`).
 
     Attributes:
         name: name in tables and files, unique in a model; the effect's random key derives from it.
@@ -184,9 +184,9 @@ class AbstractEffect(eqx.Module):
         in_likelihood: whether the exact likelihood of row histograms knows it; else simulated statistics fit it.
         stream: name of its random key; its own name if empty.
         least_frames: frames of one exposure that it takes to show it.
-        selection_nats: what its score must make up for a detail that is read off the capture and not drawn at random.
-        confounded_with: what changes darks as it does, so that only flats tell the two apart; empty if nothing does.
-        decided_by: the capture that tells them apart, as a sentence of advice.
+        selection_nats: penalty on its score, nats, for a detail measured on the capture and not drawn at random.
+        confounded_with: the effect that looks the same in darks, so that only flats separate them; empty if none does.
+        decided_by: the capture that separates them, as a sentence of advice.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -202,25 +202,25 @@ class AbstractEffect(eqx.Module):
 
     @property
     def acts_at(self) -> Stage:
-        """Its stage, or behind the gain if it has a setting `after_gain` that says so."""
+        """Its stage, or the one after the gain if its setting `after_gain` is true."""
         return Stage.BLACK if getattr(self, "after_gain", False) else self.stage
 
     @abc.abstractmethod
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames | Counts:
-        """What leaves the effect, [frame, row, column], when `signal` enters it; in the unit of its stage."""
+        """The signal [frame, row, column] after the effect, given `signal` before it, in the unit of its stage."""
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> Frames | PixelMap | None:
         """Factor on the read noise of each pixel, [frame or 1, row, column], for a signal of `shape`; None: 1.
 
-        Its mean square must be 1, so that the sigma of the read noise stays its rms. The factors of all effects
-        multiply. This is how an effect shapes the read noise without knowing the effect that draws it.
+        Its mean square must be 1, so that the sigma of the read noise remains its rms. The factors of all effects
+        multiply. Thus an effect can modify the read noise without knowing the effect that draws it.
         """
         return None
 
     def dark_current_scale(
         self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey
     ) -> Frames | PixelMap | None:
-        """Factor on the dark current of each pixel, as `read_noise_scale`, but of mean 1: the rate stays the mean."""
+        """Factor on the dark current of each pixel, like `read_noise_scale` but of mean 1: the rate stays the mean."""
         return None
 
     @classmethod
@@ -229,28 +229,28 @@ class AbstractEffect(eqx.Module):
 
         Returns:
             A function of an amplitude and a NumPy generator that makes the effect. At an amplitude of 1 it is modest:
-            a few standard errors in the statistics that it moves. Details that nobody knows (a period, a corner) are
-            drawn from the generator, so that it is recognised whatever they are.
+            a few standard errors in the statistics that it moves. Unknown details (a period, a corner) are drawn from
+            the generator, so that the effect is recognised for any details.
 
-        By default None: `diagnose` tries it only if the user hands over an instance.
+        By default None: `diagnose` tries the effect only if the user passes an instance.
         """
         return None
 
     def components(self, capture: Capture) -> dict[str, float]:
-        """What it adds to the components of the three-dimensional decomposition of dark frames, DN^2, by formula.
+        """Variance that it adds to each component of the three-dimensional decomposition of dark frames, DN^2.
 
         Keys of `hsnoise.budget`: frame, row, column, row_x_frame, column_x_frame, pixel, temporal. Means over all
         pixels and all sensors of the make, without row gain, rounding and clipping. Empty, the default, if there is no
-        simple formula: then draws tell.
+        simple formula: the variance then comes from draws.
         """
         return {}
 
     @classmethod
     def statistics(cls, frames: np.ndarray) -> dict[str, float]:
-        """Numbers of its own in which it shows, by name, of frames [frame, row, column] of one exposure.
+        """Extra statistics in which it shows, by name, of frames [frame, row, column] of one exposure.
 
-        Counts are above black, DN. A measured capture and draws of a model are compared by them, beside what all
-        captures are compared by. None by default.
+        Counts are above black, DN. They are added to the statistics by which a measured capture and draws of a model
+        are compared. None by default.
         """
         return {}
 
@@ -284,7 +284,7 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def with_default(cls) -> set[str]:
-        """Declared parameters that need not be given."""
+        """Declared parameters that are optional."""
         without = dataclasses.MISSING
         return {f.name for f in dataclasses.fields(cls) if "parameter" in f.metadata and f.default is not without}
 
@@ -298,7 +298,7 @@ class AbstractEffect(eqx.Module):
         return f"{type(self).__name__}({shown})"
 
     def settings(self) -> dict[str, Any]:
-        """Static fields, which are no physical parameters: field name to value."""
+        """Static fields, which are not physical parameters: field name to value."""
         static = [field.name for field in dataclasses.fields(self) if field.metadata.get("static", False)]
         return {name: getattr(self, name) for name in static}
 
@@ -327,16 +327,16 @@ def _shown(value: Any) -> str:
 
 
 def draw_poisson(key: RandomKey, mean: jax.Array, shape: tuple[int, ...]) -> Frames:
-    """Poisson counts of `shape`, as floats, of the means of the pixels or one for all.
+    """Poisson counts of `shape`, as floats, given a mean per pixel or one for all.
 
-    Counts are whole numbers: a draw has no derivative by its mean, so none is passed on.
+    Counts are whole numbers, so a draw has no derivative with respect to its mean.
     """
     bits = jax.random.bits(key, shape, jnp.uint32)
     return poisson_of_bits(bits, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
 
 def electrons_of_pixels(key: RandomKey, mean: Frames) -> Frames:
-    """Poisson counts of the means of all pixels, from the first word of each pixel; no derivative, as above."""
+    """Poisson counts given the means of all pixels, from the first word of each pixel; no derivative, as above."""
     first, _ = pixel_words(key, mean.shape)
     return poisson_of_bits(first, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
@@ -347,5 +347,5 @@ def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
 
 
 def step_from_previous(signal: Frames) -> Frames:
-    """Each pixel less the one read before it in its row, of whatever colour; 0 for the first of a row."""
+    """Each pixel minus the one read before it in its row, of any colour; 0 for the first of a row."""
     return signal - jnp.concatenate([signal[:, :, :1], signal[:, :, :-1]], axis=2)

@@ -1,4 +1,4 @@
-"""What is known of a capture when effects are proposed for it: what amplitudes and details are measured by."""
+"""What is known about a capture when effects are proposed for it; it sets amplitudes and details."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEAST_ELECTRONS = 0.2  # of a signal, below which nothing that acts on it shows
 
 @dataclass(frozen=True)
 class Places:
-    """What comes closest to the dark frames, whether or not there is any of it.
+    """The static patterns that fit the dark frames best, whether or not they are present.
 
     shading: axis, start, above and length of a `BlackShading`. glow: row and column of an `AmplifierGlow`.
     second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1.
@@ -31,7 +31,7 @@ class Places:
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """What a capture, and the model that was fitted to it, say about what may be missing.
+    """What a capture and the model fitted to it say about effects that may be missing.
 
     Attributes:
         effects: names of those in the model.
@@ -42,7 +42,7 @@ class CaptureFacts:
         frames: most frames of a dark exposure.
         longest_s: longest dark exposure, s; at least 1e-9, so that it divides.
         has_exposure: whether that is more than 0.
-        has_bias: whether an exposure is short enough to tell what happens while a frame waits to be read.
+        has_bias: whether an exposure is short enough to show what happens while a frame waits to be read.
         exposures_differ: whether the darks have more than one exposure.
         levels: numbers of signal levels: exposures of the darks, and flats.
         light_e: mean photoelectrons of a pixel in the brightest flat; 0 without flats.
@@ -75,20 +75,20 @@ class CaptureFacts:
 
     @property
     def signal_e(self) -> float:
-        """Mean electrons of a pixel, of light or of the dark current, in the exposure that has most."""
+        """Mean electrons of a pixel, from light or dark current, in the exposure with the most."""
         return max(self.dark_e, self.light_e)
 
     @property
     def shows_dark_current(self) -> bool:
-        """Whether enough dark electrons are collected for what acts on them to show."""
+        """Whether there are enough dark electrons for effects on them to show."""
         return self.dark_e > LEAST_ELECTRONS
 
     @property
     def shows_signal(self) -> bool:
-        """Whether enough electrons are collected for what acts on them to show."""
+        """Whether there are enough electrons for effects on them to show."""
         return self.signal_e > LEAST_ELECTRONS
 
 
 def either_side(rng: np.random.Generator) -> bool:
-    """Whether an offset arises after the gain: a detail that nobody knows."""
+    """Whether an offset arises after the gain: an unknown detail, drawn at random."""
     return bool(rng.integers(2))

@@ -16,7 +16,7 @@ import numpy as np
 class ParameterSpec:
     """What an effect declares about one parameter: unit, inclusive bounds (None: unbounded), meaning, whether held.
 
-    amplitude: whether it says how strong the effect is; absent: the value at which there is none of it.
+    amplitude: whether it says how strong the effect is; absent: the value at which the effect vanishes.
     """
 
     unit: str
@@ -33,7 +33,7 @@ class ParameterSpec:
         return value in (self.low, self.high) if self.held == "at bounds" else self.held
 
     def from_absent(self, value: float, error: float = 0.0) -> tuple[float, float]:
-        """How far a value is from absent, and the standard error of that; 1/value where infinity is absent."""
+        """Distance of a value from absent, and its standard error; 1/value where infinity is absent."""
         if math.isinf(self.absent):
             return 1 / value, error / value**2
         return value - self.absent, error
@@ -83,12 +83,12 @@ def param(
         per_channel: one value per colour channel; a scalar given instead holds for all channels.
         default: value unless one is given; None: one must be given.
         doc: its meaning in a few words.
-        held: fits leave it at its value; for what the statistics of a capture do not tell smoothly. "at bounds": only
-            if it lies at one, such as a place at the edge of the frame.
+        held: fits leave it at its value, because the statistics do not depend on it smoothly. "at bounds": only if it
+            lies at one, such as a place at the edge of the frame.
         amplitude: whether it says how strong the effect is. With all its amplitudes at `absent` an effect does nothing;
             `diagnose` scales them, and `improve` keeps an effect only if one of them is far enough from there.
-        absent: the value of an amplitude at which there is none of the effect: 0, 1 for a factor, or infinity, which
-            the parameter need not be able to take.
+        absent: the value of an amplitude at which the effect vanishes: 0, 1 for a factor, or infinity, even if the
+            parameter cannot take it.
     """
     spec = ParameterSpec(unit, low, high, per_channel, doc, held, amplitude, absent)
     metadata = {"parameter": spec}

@@ -13,11 +13,11 @@ from hsnoise.effects._parameters import param
 class BlackClamp(AbstractEffect):
     """The camera subtracts rate * exposure DN, estimated from pixels that see no light.
 
-    Optically black pixels collect dark electrons as the others do; subtracting their mean keeps the black level where
-    it belongs, but not the shot noise. The clamp is complete where `rate` is gain times dark current.
+    Optically black pixels collect dark electrons like the others. Subtracting their mean keeps the black level in
+    place, but does not remove the shot noise. The clamp is complete if `rate` is gain times dark current.
 
-    In dark frames: the mean does not follow the exposure (or follows it too little), the variance does. From darks
-    alone it is told from another gain and dark current only by skewness, clipping and row gains; a flat decides.
+    In dark frames: the mean does not follow the exposure (or follows it too little), the variance does. In darks alone,
+    only skewness, clipping and row gains distinguish it from another gain and dark current; a flat decides.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (optical black, clamping).
     """

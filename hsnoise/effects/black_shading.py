@@ -17,16 +17,17 @@ from hsnoise.effects._parameters import param
 class BlackShading(AbstractEffect):
     """Offset in DN that decays exponentially from the first or last column (row), the same in all frames.
 
-    The output amplifier and the reference of the converter settle while a line is read, and warm up while a frame is:
-    the black level drifts along it. Its mean is zero and its rms `amplitude`; a `length` of several frames makes it
-    a straight line.
+    The output amplifier and the reference of the converter settle while a row is read, and warm up while a frame is
+    read, so the black level drifts. The mean of the drift is zero and its rms is `amplitude`; a `length` of several
+    frames makes it a straight line.
 
-    In dark frames: one side is brighter or darker than the other, alike in all frames and exposures, bias frames too.
+    In dark frames: one side is brighter or darker than the other, equally in all frames and exposures, including bias
+    frames.
 
     Attributes:
         axis: "column" if it changes over the columns, "row" if over the rows.
         start: "first" or "last": the column (row) where it is steepest.
-        above: whether it lies above the mean there, not below.
+        above: whether it lies above the mean there; otherwise below.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (nonuniformity of low spatial frequency).
     """

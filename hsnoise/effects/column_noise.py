@@ -24,8 +24,8 @@ class ColumnNoise(AbstractEffect):
     In dark frames: vertical streaks that change from frame to frame, equally strong in all colours and exposures.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """

@@ -17,11 +17,11 @@ from hsnoise.effects._parameters import param
 class CosmicRays(AbstractEffect):
     """Hits of single pixels, Poisson in space and time, each with an exponentially distributed charge.
 
-    Muons and decays in the sensor's surroundings leave some 80 electrons for each micrometre of silicon they cross.
-    Tracks over several pixels are not described. Two hits of one pixel in one exposure count as one.
+    Muons and decays in the sensor's surroundings leave some 80 electrons per micrometre of silicon that they cross.
+    Tracks over several pixels are not modelled. Two hits of one pixel in one exposure count as one.
 
-    In dark frames: bright single pixels, in other places in each frame, their number in proportion to exposure, beside
-    those that hit while a frame waits to be read.
+    In dark frames: bright single pixels in different places in each frame. Their number is proportional to exposure,
+    apart from hits while a frame waits to be read.
 
     Reference: Groom, "Cosmic rays and other nonsense in astronomical CCD imagers", Exp. Astron. 14, 2002.
     """

@@ -15,13 +15,13 @@ from hsnoise.effects._parameters import param
 class Crosstalk(AbstractEffect):
     """Each of the four neighbours of a pixel gets `fraction` of its electrons: (1 - 4 f) x + f (sum of neighbours).
 
-    Capacitance between the sense nodes couples pixels after their charge was collected, so that their shot noise is
-    shared, too: its variance is (1 - 4 f)^2 + 4 f^2 of what it was. (Electrons that diffuse before they are collected
-    are independent Poisson counts again: a blur of the light, nothing in dark frames.) Nothing is lost: what would
-    leave the frame stays in the pixel. In a Bayer sensor neighbours have other colours.
+    Capacitance between the sense nodes couples pixels after their charge was collected, so shot noise is shared, too:
+    its variance is multiplied by (1 - 4 f)^2 + 4 f^2. (Electrons that diffuse before they are collected remain
+    independent Poisson counts: a blur of the light, invisible in dark frames.) Charge is conserved: the share that
+    would leave the frame stays in the pixel. In a Bayer sensor neighbours have other colours.
 
     In dark frames: the noise of the four neighbours is correlated, in proportion to the shot noise, while the mean
-    stays: the slope of the photon transfer line is less than the gain.
+    does not change: the slope of the photon transfer line is less than the gain.
 
     Reference: Moore, Ninkov, Forrest, "Quantum efficiency overestimation and deterministic cross talk resulting from
     interpixel capacitance", Opt. Eng. 45, 2006.

@@ -16,9 +16,8 @@ class DarkCurrentDrift(AbstractEffect):
     """Extra dark electrons, Poisson(slope * exposure * f), in frame f = 0, 1, ...
 
     The sensor warms up while it records, and dark current doubles about every 6 to 8 degrees. To first order the rate
-    grows in proportion to the number of frames since the start of each exposure series. Only warming is described:
-    dark current that falls would need a negative number of electrons where there are none; there, the first frames
-    are the odd ones.
+    grows in proportion to the number of frames since the start of each exposure series. Only warming is modelled:
+    a falling dark current could require a negative number of electrons.
 
     In dark frames: the frame mean and its shot noise rise from frame to frame, in proportion to exposure.
 

@@ -14,7 +14,7 @@ from hsnoise.effects._parameters import param
 
 
 class DarkCurrentNonuniformity(AbstractEffect):
-    """Every pixel has its own dark current, the same in all frames: log-normal, mean over pixels unchanged.
+    """Every pixel has its own dark current, the same in all frames: log-normal, with an unchanged mean over pixels.
 
     Defects and fields in the silicon differ from pixel to pixel. The factor exp(spread z - spread^2 / 2) with z normal
     has mean 1, so the rate of the dark current stays its mean over pixels. A few pixels far above it are `hot_pixels`.

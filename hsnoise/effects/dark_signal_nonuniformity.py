@@ -16,14 +16,14 @@ from hsnoise.effects._parameters import param
 class DarkSignalNonuniformity(AbstractEffect):
     """Offset of each pixel, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
 
-    Thresholds of the pixels' transistors differ. What grows with exposure instead is `dark_current_nonuniformity`
+    Thresholds of the pixels' transistors differ. A pattern that grows with exposure is `dark_current_nonuniformity`
     or `hot_pixels`.
 
     In dark frames: a grain that stays when frames are averaged, equally strong in all exposures.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU).
     """

@@ -18,11 +18,11 @@ class FrameOffset(AbstractEffect):
 
     The reference of the black level is sampled once a frame, or the black clamp averages too few pixels.
 
-    In dark frames: the mean of frames scatters by more than the noise of their pixels allows, in all colours alike.
+    In dark frames: frame means scatter by more than the pixels' noise explains, equally in all colours.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
     """

@@ -21,11 +21,11 @@ KNOTS, FINE_KNOTS = 1024, 4096
 class HeavyTailedReadNoise(AbstractEffect):
     """Read noise follows Student's t with `dof` degrees of freedom, its standard deviation unchanged.
 
-    Noise of transistors whose traps switch is no longer normal. Student's t is a normal variable whose variance is
-    new in each pixel and frame: its factor is sqrt((dof - 2) / chi2(dof)), of mean square 1. The excess kurtosis is
+    Switching traps make the noise of transistors non-normal. Student's t is a normal variable whose variance is new in
+    each pixel and frame: the factor is sqrt((dof - 2) / chi2(dof)), of mean square 1. The excess kurtosis is
     6 / (dof - 4) for dof > 4. The larger dof, the closer to a Gaussian.
 
-    In dark frames: more far outliers, both ways, anywhere and anew in each frame.
+    In dark frames: more far outliers of both signs, anywhere, in new places in each frame.
 
     Reference: Wei, Fu, Zheng, Yang, "Physics-based noise modeling for extreme low-light photography", IEEE TPAMI 2021
     (long-tailed read noise).

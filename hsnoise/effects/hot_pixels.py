@@ -20,15 +20,15 @@ class HotPixels(AbstractEffect):
     """Extra dark electrons, Poisson(rate_i * exposure + at_readout_i), in a fraction of the pixels, always the same.
 
     Defects of the silicon, many by radiation, generate charge. Every pixel is hot with probability `fraction`,
-    independently; the rates of hot pixels are exponentially distributed with mean `rate`. They go on while a frame
-    waits to be read, for the same time in each: `at_readout` is in proportion to the rate.
+    independently; the rates of hot pixels are exponentially distributed with mean `rate`. They generate charge also
+    while a frame waits to be read, for the same time in each frame: `at_readout` is proportional to the rate.
 
-    A single generation centre emits a hole, then an electron: where both steps take as long, every second arrival of a
-    Poisson process is an electron, and the variance of many is half of their mean. `fano` is that ratio for large
-    charges: a share 2 (1 - fano) of the charge comes so, the rest is Poisson.
+    A single generation centre emits a hole, then an electron: if both steps take equally long, every second arrival of
+    a Poisson process is an electron, and the variance of many is half of their mean. `fano` is that ratio for large
+    charges: a share 2 (1 - fano) of the charge arrives this way, the rest is Poisson.
 
-    In dark frames: bright dots at fixed places that grow with exposure, each with its own shot noise, and of slow
-    sensors fainter in bias frames, too.
+    In dark frames: bright dots at fixed places that grow with exposure, each with its own shot noise; in slow sensors
+    they also show, fainter, in bias frames.
 
     References: Cox, *Renewal Theory*, 1962; Hopkinson, Dale, Marshall, "Proton effects in charge-coupled devices", IEEE
     Trans. Nucl. Sci. 43, 1996.

@@ -16,7 +16,7 @@ class ImageLag(AbstractEffect):
     """Frame f holds (1 - fraction) of its own electrons and `fraction` of those of frame f - 1.
 
     The transfer gate does not empty the photodiode, and the rest is read with the next frame. Before the first frame
-    the sensor saw the same as in the first one, which therefore stays as it is.
+    the sensor is assumed to have seen the same scene, so the first frame does not change.
 
     In dark frames: consecutive frames are correlated pixel by pixel, in proportion to the shot noise. Moving light
     leaves trails.

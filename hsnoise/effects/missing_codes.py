@@ -17,12 +17,12 @@ from hsnoise.effects._parameters import param
 class MissingCodes(AbstractEffect):
     """The converter works in steps of `gain` DN, and a digital gain stretches its codes: round(gain round(y / gain)).
 
-    Cameras reach their highest sensitivities by multiplying counts. About one in `gain` codes is left; the mean
-    stays, because the gain of the model is that of the whole camera. Add it after `adc`, so that it acts on counts.
-    With gain 1, counts stay as they are.
+    Cameras reach their highest sensitivities by multiplying counts. About one in `gain` codes remains; the mean does
+    not change, because the model's gain is for the whole camera. Add it after `adc`, so that it acts on counts. With
+    gain 1, counts do not change.
 
-    In dark frames: gaps at regular distances in the histogram of counts, alike in all exposures. `diagnose` takes the
-    gain from there; a fit holds it.
+    In dark frames: regularly spaced gaps in the histogram of counts, the same in all exposures. `diagnose` takes the
+    gain from them; a fit holds it.
 
     Attributes:
         white_level_dn: largest count, DN, to which stretched codes are clipped; None for that of the integer type.

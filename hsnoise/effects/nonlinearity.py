@@ -15,13 +15,13 @@ LEVELS_OF_A_CURVE = 3  # a straight line goes through any two
 
 
 class Nonlinearity(AbstractEffect):
-    """Signal x of more than 0 electrons reads x - curvature x^2.
+    """A signal of x > 0 electrons reads x - curvature x^2.
 
-    The capacitance of the sense node grows as it fills, and the source follower leaves its linear range. Positive
-    curvature is a response that falls behind; it ends level at its summit, x = 1 / (2 curvature). It acts before the
-    gain, on the signal with its read noise.
+    The capacitance of the sense node grows as it fills, and the source follower leaves its linear range. With positive
+    curvature the response falls behind, and is constant beyond its maximum, x = 1 / (2 curvature). The effect acts
+    before the gain, on the signal with its read noise.
 
-    In dark frames: next to nothing, unless long exposures collect many electrons; flats show means that fall behind
+    In dark frames: almost nothing, unless long exposures collect many electrons; flats show means that fall behind
     the light, and a photon transfer curve that bends.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (V/V and V/e- nonlinearity).

@@ -13,11 +13,11 @@ from hsnoise.effects._parameters import param
 
 
 class OddEvenPattern(AbstractEffect):
-    """Two readout chains take turns: alternating columns, in a Bayer sensor alternating pairs of columns.
+    """Two readout chains alternate: by columns, in a Bayer sensor by pairs of columns.
 
-    Amplifiers above and below the sensor are never quite equal. The second chain reads `offset` more electrons and
-    has a gain larger by `gain_mismatch` than the first; each differs by half of it from the mean of both, which stays
-    as it is. Pairs of columns, because each chain must read all colours.
+    Amplifiers above and below the sensor are never quite equal. The second chain reads `offset` more electrons than the
+    first, and its gain is larger by `gain_mismatch`; each differs by half of that from the mean of both, which does not
+    change. Bayer sensors use pairs of columns because each chain must read all colours.
 
     In dark frames: a fine vertical grating, the same in all frames; with a gain mismatch its contrast grows with
     exposure, and the noise of the columns alternates.

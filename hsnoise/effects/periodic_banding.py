@@ -18,16 +18,16 @@ from hsnoise.effects._parameters import param
 class PeriodicBanding(AbstractEffect):
     """Offset amplitude * sin(2 pi frequency i + phase) of row (column) i, e-, with a uniform phase in each frame.
 
-    A clock or a power supply couples into the readout; its frequency keeps no step with the frames. Its variance is
+    A clock or a power supply couples into the readout; it is not synchronised with the frames. The variance is
     amplitude^2 / 2.
 
-    In dark frames: bands that run from frame to frame, one sharp line in the spectrum of row (column) means. `diagnose`
-    takes the frequency from there; a fit holds it and finds the amplitude.
+    In dark frames: bands that move from frame to frame, and one sharp spectral line of the row (column) means.
+    `diagnose` takes the frequency from that line; a fit holds it and finds the amplitude.
 
     Attributes:
         axis: "row" for a sinusoid over rows (horizontal bands), "column" for one over columns.
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (pick-up noise).
     """

@@ -16,12 +16,12 @@ from hsnoise.effects._parameters import param
 class RandomTelegraphNoise(AbstractEffect):
     """A fraction of the pixels, the same in all frames, reads `amplitude` more electrons in its high state.
 
-    A trap in the oxide of the pixel's source follower catches and frees a single carrier. Every pixel has such a trap
-    with probability `fraction`; its state is new in each frame (traps are faster than the frame rate), high with
-    probability `duty`. The low level is the pixel's ordinary one, so the pixel's mean rises by amplitude * duty.
+    A trap in the oxide of the pixel's source follower catches and frees a single carrier. Every pixel has a trap with
+    probability `fraction`; its state is new in each frame (traps are faster than the frame rate) and high with
+    probability `duty`. The low level is the pixel's ordinary level, so its mean rises by amplitude * duty.
 
-    In dark frames: histograms over time of single pixels have two peaks; variance over time has a far tail over
-    pixels, the same in all exposures.
+    In dark frames: histograms of single pixels over time have two peaks; the distribution over pixels of the variance
+    over time has a long tail, the same in all exposures.
 
     Reference: Wang, Rao, Mierop, Theuwissen, "Random telegraph signal in CMOS image sensor pixels", IEDM 2006.
     """

@@ -12,7 +12,7 @@ from hsnoise.effects._parameters import param
 class ReadNoise(AbstractEffect):
     """Read noise: Normal(0, sigma^2) in each pixel, referred to electrons.
 
-    Effects that shape it (heavy tails, another sigma in each pixel) give factors of mean square 1, so sigma stays
+    Effects that modify it (heavy tails, another sigma in each pixel) are factors of mean square 1, so sigma remains
     the standard deviation, rms over pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.

@@ -14,13 +14,13 @@ from hsnoise.effects._parameters import param
 
 
 class ReadNoiseNonuniformity(AbstractEffect):
-    """Every pixel has its own read-noise sigma, the same in all frames: log-normal, rms over pixels unchanged.
+    """Every pixel has its own read-noise sigma, the same in all frames: log-normal, with an unchanged rms over pixels.
 
     Source followers differ in their flicker noise. The factor exp(spread z - spread^2) with z normal has mean square
     1, so the sigma of the read noise stays its rms over pixels.
 
-    In dark frames: variance over time differs between pixels by more than chance, alike in all exposures; over all
-    pixels the tails are heavy.
+    In dark frames: variance over time differs between pixels by more than chance, equally in all exposures; the
+    histogram of all pixels has heavy tails.
 
     Reference: Janesick, Andrews, Elliott, "Fundamental performance differences between CMOS and CCD imagers",
     Proc. SPIE 6276, 2006.

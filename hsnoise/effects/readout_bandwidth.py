@@ -13,11 +13,11 @@ from hsnoise.effects._parameters import param
 class ReadoutBandwidth(AbstractEffect):
     """Pixel j of a row reads (1 - fraction) of itself and `fraction` of pixel j - 1, read just before it.
 
-    The output amplifier has not settled when the next pixel is sampled. It acts on the read noise, too; in a Bayer
-    sensor the previous pixel has another colour. The first pixel of a row follows a level like its own, so means
-    stay as they are.
+    The output amplifier has not settled when the next pixel is sampled. This also affects the read noise; in a Bayer
+    sensor the previous pixel has another colour. The first pixel of a row follows its own level, so means do not
+    change.
 
-    In dark frames: noise of neighbours along the row is correlated and its variance (1 - f)^2 + f^2 of what it was, at
+    In dark frames: noise of neighbours along the row is correlated and its variance multiplied by (1 - f)^2 + f^2, at
     all exposures; noise of neighbours along the column is not correlated.
 
     Reference: Janesick, *Scientific Charge-Coupled Devices*, SPIE 2001 (settling of the video signal).

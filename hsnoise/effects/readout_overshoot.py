@@ -11,14 +11,14 @@ from hsnoise.effects._parameters import param
 
 
 class ReadoutOvershoot(AbstractEffect):
-    """Pixel j of a row reads itself and `fraction` of its difference from pixel j - 1, read just before it.
+    """Pixel j of a row reads itself plus `fraction` of its difference from pixel j - 1, read just before it.
 
     The output amplifier swings beyond its new level, or the clamp of correlated double sampling still holds some of the
-    previous pixel. It acts on the read noise, too; in a Bayer sensor the previous pixel has another colour. The first
-    pixel of a row follows a level like its own, so means stay as they are. The opposite of `ReadoutBandwidth`.
+    previous pixel. This also affects the read noise; in a Bayer sensor the previous pixel has another colour. The first
+    pixel of a row follows its own level, so means do not change. The opposite of `ReadoutBandwidth`.
 
-    In dark frames: noise of neighbours along the row is anticorrelated and its variance (1 + f)^2 + f^2 of what it was,
-    at all exposures; behind a bright pixel lies a dark one.
+    In dark frames: noise of neighbours along the row is anticorrelated and its variance multiplied by (1 + f)^2 + f^2,
+    at all exposures; a bright pixel is followed by a dark one.
 
     Reference: Janesick, *Scientific Charge-Coupled Devices*, SPIE 2001 (settling of the video signal).
     """

@@ -21,8 +21,8 @@ class RowFixedPattern(AbstractEffect):
     In dark frames: horizontal streaks that stay when frames are averaged.
 
     Attributes:
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (DSNU of rows).
     """

@@ -15,7 +15,7 @@ from hsnoise.effects._parameters import param
 class RowGain(AbstractEffect):
     """Gain max(beta, 0) of each row, one series beta[frame, row, channel] of mean 1 per colour and frame.
 
-    A series runs over all sensor rows; a colour uses the rows it has. With a rolling shutter it is a stationary
+    A series runs over all sensor rows; each colour uses its own rows. With a rolling shutter it is a stationary
     periodic Gaussian process whose independent periodogram bins k = 0 ... rows/2 (cycles per frame) have a mean power
     of sigma^2 times
 

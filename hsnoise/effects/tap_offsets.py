@@ -16,15 +16,15 @@ from hsnoise.effects._parameters import param
 class TapOffsets(AbstractEffect):
     """Each of `taps` equal blocks of columns has its own offset, Normal(0, sigma^2) in e-, the same in all frames.
 
-    Fast sensors read blocks of columns through outputs of their own, whose offsets are trimmed only so well. The mean
-    of so few offsets is not zero; a fit sees it as part of the black level.
+    Fast sensors read blocks of columns through separate outputs, whose offsets are only trimmed to some accuracy. The
+    mean of so few offsets is not zero; a fit sees it as part of the black level.
 
-    In dark frames: vertical panels with sharp edges, alike in all exposures.
+    In dark frames: vertical panels with sharp edges, the same in all exposures.
 
     Attributes:
         taps: number of outputs, at least 2.
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
-            electrons are then DN over the mean gain of the pixels.
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: EMVA Standard 1288, release 4.0, 2021 (nonuniformity of columns).
     """

@@ -16,7 +16,7 @@ WRONG, WRONG_SIGMAS = 0.08, 3.0  # of a stated gain: relative difference, standa
 
 
 def flat_notes(result: FitResult) -> list[str]:
-    """What is to be said of the flats of a fit."""
+    """Notes on the flats of a fit."""
     flats = result.summary.flats
     if flats is None:
         return []
@@ -24,7 +24,7 @@ def flat_notes(result: FitResult) -> list[str]:
 
 
 def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -> list[str]:
-    """What is to be said of the gain that flats give."""
+    """Notes on the gain from flats."""
     notes = list(flats.set_aside)
     for c, channel in enumerate(channels):
         of = "" if channel == "mono" else f" of channel {channel}"
@@ -49,8 +49,8 @@ def _left_out(found: FlatGain, c: int, of: str) -> list[str]:
     if not above.size:
         return []
     return [
-        f"The variance of the flats{of} leaves its curve above {top:.4g} DN of signal, where it bends down or falls, as"
-        f" it does near saturation: {above.size} level{'s' * (above.size > 1)} from {above.min():.4g} DN on left out."
+        f"The variance of the flats{of} leaves its curve above {top:.4g} DN of signal, as it does near saturation:"
+        f" {above.size} level{'s' * (above.size > 1)} from {above.min():.4g} DN on left out."
     ]
 
 
@@ -60,7 +60,7 @@ def _bent(found: FlatGain, c: int, of: str) -> list[str]:
     off = float(variance_curve(found, c, found.full_scale_dn[c])) - 1
     return [
         f"The response{of} bends: variance over signal changes by {off:+.1%} from low signal to"
-        f" {found.full_scale_dn[c]:.4g} DN, and the gain by about {off * 2 / 3:+.1%}. The gain given is that at low"
+        f" {found.full_scale_dn[c]:.4g} DN, and the gain by about {off * 2 / 3:+.1%}. The gain is given for low"
         " signal."
     ]
 
@@ -71,14 +71,15 @@ def _scattered(found: FlatGain, c: int, of: str) -> list[str]:
         return []
     levels = found.level_gain[found.used[:, c], c]
     return [
-        f"No line and no smooth curve describes the flats{of}: variance over signal lies between {levels.min():.4g}"
-        f" and {levels.max():.4g} DN/e- (chi2 {found.chi2[c]:.0f} for {found.dof[c]} degrees of freedom). The gain is"
-        f" that of EMVA 1288's line, levels up to {LINE_RANGE:.0%} of saturation; its error is what they differ by."
+        f"Neither a line nor a smooth curve describes the flats{of}: variance over signal ranges from"
+        f" {levels.min():.4g} to {levels.max():.4g} DN/e- (chi2 {found.chi2[c]:.0f} for {found.dof[c]} degrees of"
+        f" freedom). The gain is from EMVA 1288's line, levels up to {LINE_RANGE:.0%} of saturation; its error is the"
+        " scatter of the levels."
     ]
 
 
 def _falling_black(found: FlatGain, flats: FlatMoments) -> list[str]:
-    """An overscan that moves away from the level of the darks where light falls on the pixels."""
+    """An overscan that departs from the level of the darks when the pixels are lit."""
     off = flats.overscan_dn - flats.dark_dn.mean(1)
     signal = found.signal_dn.mean(1)
     known = np.isfinite(off) & (signal > 0)
@@ -92,13 +93,13 @@ def _falling_black(found: FlatGain, flats: FlatMoments) -> list[str]:
     words = "falls" if off[i] < 0 else "rises"
     return [
         f"The black level {words} with the signal: the overscan lies {off[i]:+.4g} DN from the darks' level at"
-        f" {signal[i]:.4g} DN. The gain takes the level of the darks for black; from the overscan it would be"
-        f" {1 / (1 - share) - 1:+.0%} different."
+        f" {signal[i]:.4g} DN. The gain uses the level of the darks as black; with the overscan as black it would"
+        f" differ by {1 / (1 - share) - 1:+.0%}."
     ]
 
 
 def stated_gain_note(stated: StatedGain | None, gain_dn_per_e: float, error: float) -> list[str]:
-    """That a gain which headers state is not the sensor's; nothing where they agree or state none."""
+    """A note if the gain in the headers disagrees with the frames; none if they agree or state no gain."""
     if stated is None or not np.isfinite(gain_dn_per_e):
         return []
     off = abs(stated.value_dn_per_e - gain_dn_per_e)

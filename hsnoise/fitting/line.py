@@ -40,7 +40,7 @@ class LineFit:
 
 
 class _Points(NamedTuple):
-    """Statistics of the rows of each exposure, flats behind darks: [replicate, channel, point].
+    """Statistics of the rows of each exposure, flats after darks: [replicate, channel, point].
 
     level (DN), variance within rows, power of row means about their frame's mean (DN^2); the numbers of pixels and
     rows they stand on. bands [replicate, channel, dark, band]: the power of the darks by row frequency.
@@ -66,7 +66,7 @@ class _Correction(NamedTuple):
     """Normalised and corrected points [replicate, channel, point].
 
     True mean (DN) and variance (DN^2) at a row gain of 1, weight of the point in the line, response (DN) of row means
-    to the row gain, the same squared noise of a row's gain, whether a law of the family has the pair.
+    to the row gain, the same squared noise of a row's gain, whether some distribution of the family has the pair.
     """
 
     mean: np.ndarray
@@ -318,7 +318,7 @@ def _estimate(points: _Points, setting: _Setting) -> tuple[_Estimate, _Correctio
 
 
 def _exponent(points: _Points, correction: _Correction, row_variance, setting: _Setting) -> np.ndarray:
-    """Exponent of the spectrum of the row gain [replicate], exposures pooled by what they tell; 0 if global."""
+    """Exponent of the spectrum of the row gain [replicate], exposures weighted by information; 0 if global."""
     summary = setting.summary
     if summary.shutter == "global":
         return np.zeros(len(row_variance))

@@ -74,7 +74,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     vector, whiten, iterations = pilot.vector, pilot.whiten / np.sqrt(thinning), pilot.iterations
     for turn in range(TURNS):
         darks, flats = _pieces(coordinates, vector, summary, frames)
-        # Rows tell of their neighbours' gains: all of them know more than the thinned ones scaled up.
+        # Rows inform about their neighbours' gains: all rows know more than the thinned ones scaled up.
         guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
         _, _, whiten = _curvature(coordinates, vector, whiten, guide)
         if turn == 0:
@@ -204,7 +204,7 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
 
 
 def _chords(vector, whiten, gradients):
-    """Newton steps with the curvature that `whiten` tells: (vector, value, standard errors left, steps).
+    """Newton steps with the curvature in `whiten`: (vector, value, standard errors left, steps).
 
     A step that leads down, and farther away, is tried again at a quarter of its length.
     """
@@ -246,7 +246,7 @@ def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
 
 
 def _told(y, told):
-    """The function of which value and slope at `y` were told."""
+    """The function with the given value and slope at `y`."""
     value, slope = told
     return value + slope @ (y - jax.lax.stop_gradient(y)), None
 
@@ -333,7 +333,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
         low, high = (np.asarray(g) / s for g, s in zip(gradients, slopes, strict=True))
         row = -(high - low) / (values[1][i] - values[0][i])
         if row[i] <= 0:
-            row[i] = low[i] ** 2  # falls from the bound like an exponential law, whose deviation is 1 / slope
+            row[i] = low[i] ** 2  # falls from the bound like an exponential distribution, whose deviation is 1 / slope
         alone = np.where(np.arange(len(row)) == i, row, 0.0)
         coupled = np.where(np.isin(np.arange(len(row)), at_bound), alone, row)
         # Measured over a range, the couplings may contradict the rest: then they are left out.

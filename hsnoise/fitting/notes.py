@@ -1,4 +1,4 @@
-"""Sentences on what a capture does not determine, and which capture would."""
+"""Notes on what a capture does not determine, and which capture would."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import RowHistograms
 
 UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
-LEAST_OUTLIERS = 5  # pixels; fewer are chance
+LEAST_OUTLIERS = 5  # pixels; fewer may be chance
 MISPLACED_FRACTION = 0.03
 LIGHT_E_PER_S = 2e4  # a dark current above this looks like light
-LIT_SIGMA = 5.0  # standard deviations of a pixel above black that no short dark is
+LIT_SIGMA = 5.0  # standard deviations of a pixel above black; no short dark reaches this level
 WARMING, WARMING_SIGMA, FEWEST_IN_SERIES = 0.05, 8.0, 4  # share of the dark signal, standard errors, frames
-DRIFT_SIGMA = 0.5  # of a pixel: means of frames of one exposure drift less
+DRIFT_SIGMA = 0.5  # standard deviations of a pixel: frame means of one exposure drift less
 
 
 def closing_notes(result: FitResult) -> tuple[str, ...]:
-    """All sentences that belong under the table of `result`."""
+    """All notes printed under the table of `result`."""
     misfit = _misfit_notes(result) if result.summary.histograms else flat_notes(result)
     circumstances = (note(result) for note in (_left_out_note, order_note, _warming_note, _light_note))
     return (*parameter_notes(result), *misfit, *chain.from_iterable(circumstances))
 
 
 def pixel_notes(result: FitResult) -> tuple[str, ...]:
-    """Sentences under the table of a fit that is conditional on the pixel: no histogram of pooled pixels is its own."""
+    """Notes under the table of a pixel-conditional fit, which has no histogram of pooled pixels."""
     circumstances = (note(result) for note in (order_note, _warming_note, _light_note))
     return (*parameter_notes(result), *chain.from_iterable(circumstances))
 
 
 def parameter_notes(result: FitResult) -> list[str]:
-    """What the capture does not determine of the paper's effects."""
+    """Parameters of the paper's effects that the capture does not determine."""
     table, numbers = result.table, numbers_of(result.params)
     return [note for number in numbers if (note := _note(number, table[number.name], result))]
 
 
 def near_zero(name: str, value: float, error: float, unit: str = "") -> str:
-    """That a size may be 0, and what it is below, in words."""
+    """The statement that a size is compatible with 0, with its upper limit."""
     return f"{name} is compatible with zero (below {f'{value + 2 * error:.2g} {unit}'.rstrip()})"
 
 
@@ -58,7 +58,7 @@ def _note(number: Number, row: tuple[float, float, str], result: FitResult) -> s
             known = "" if np.isinf(error) else f" (standard error {error:.2g} {unit})"
             return f"{name} is not determined{known}: add flats, or darks of longer exposures."
         case "gain", _ if relative > WEAK:
-            known = f"{name} is known to {relative:.0%} only, with read noise and dark current"
+            known = f"{name} is known only to {relative:.0%}, and so are read noise and dark current"
             return f"{known}: add flats, or longer darks."
         case "read_noise", "sigma" if relative > UNDETERMINED:
             in_dn = value * float(np.mean(result.params["gain"].value))
@@ -75,7 +75,7 @@ def _note(number: Number, row: tuple[float, float, str], result: FitResult) -> s
 
 def _row_gain_note(number: Number, value: float, error: float, result: FitResult) -> str | None:
     name, fitted = number.name, number.name in result.names
-    # It is a variance that is estimated: its own error is 2 value x error.
+    # The estimate is of the variance, whose error is 2 value x error.
     if number.field == "sigma" and np.isinf(error):
         return f"{name} is not determined: add darks of longer exposures, or flats."
     if number.field == "sigma" and value < 4 * error:
@@ -83,12 +83,12 @@ def _row_gain_note(number: Number, value: float, error: float, result: FitResult
     if number.field == "exponent" and fitted and error > 0.4:
         return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
     if number.field == "white_share" and fitted and error > 0.1:
-        return f"{name} and row_gain.exponent are hardly told apart, and their errors are rough: add frames."
+        return f"{name} and row_gain.exponent can hardly be separated, and their errors are rough: add frames."
     return None
 
 
 def _has_bias(result: FitResult) -> bool:
-    """Whether there are darks of no exposure."""
+    """Whether there are bias frames (darks of 0 s)."""
     return len(result.summary.exposure_s) > 0 and bool(result.summary.exposure_s.min() == 0)
 
 
@@ -120,14 +120,14 @@ def outlier_fraction(result: FitResult) -> np.ndarray:
 
 
 def _misfit_notes(result: FitResult) -> list[str]:
-    """What the fitted histograms miss: outliers, and a shape that the model does not have."""
+    """What the fitted histograms miss: outliers, and a shape that the model cannot produce."""
     notes = []
     outside = result.outliers
     if outside is not None:
         e = int(outside.argmax())
         notes.append(
-            f"{100 * outside[e]:.2g} % of the pixels at {result.summary.exposure_s[e]:g} s follow no law of this model"
-            " (hot pixels, cosmic hits, ...): they were set apart, and the model does not reproduce them."
+            f"{100 * outside[e]:.2g} % of the pixels at {result.summary.exposure_s[e]:g} s do not follow this model"
+            " (hot pixels, cosmic hits, ...): the fit excludes them, and the model does not reproduce them."
         )
     for h, (law, deviation) in zip(result.summary.histograms, result.expected_laws(), strict=True):
         e, misplaced, chance = _misplaced(h, law, deviation, result.summary)
@@ -135,20 +135,20 @@ def _misfit_notes(result: FitResult) -> list[str]:
             channel = "" if h.channel == "mono" else f" of channel {h.channel}"
             exposure_s = result.summary.exposure_s[e]
             notes.append(
-                f"The model misplaces {misplaced:.0%} of the pixels{channel} at {exposure_s:g} s: these frames hold an"
-                " effect that it lacks; read its parameters and standard errors with that in mind."
+                f"The model misplaces {misplaced:.0%} of the pixels{channel} at {exposure_s:g} s: it lacks an effect"
+                " that these frames show, which may bias its parameters and standard errors."
             )
             break
     return notes + flat_notes(result)
 
 
 def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int, float, float]:
-    """Exposure where the histogram is furthest off, what share of its pixels, and what chance alone would make."""
+    """The exposure with the worst histogram, the share of its pixels that is misplaced, and the share by chance."""
     measured = h.counts.sum((1, 2), dtype=np.float64)
     pixels = np.maximum(measured.sum(1, keepdims=True), 1)
     share = 0.5 * np.abs(measured / pixels - law).sum(1)
     rows = (h.row_pixels > 0).sum((1, 2))
-    # Coloured rows of a frame go together: count two independent ones a frame.
+    # Coloured row gains are correlated within a frame: count two independent rows per frame.
     independent = rows if summary.shutter == "global" else 2 * np.asarray(summary.n_frames)
     scatter = np.sqrt(deviation**2 / np.maximum(independent, 1)[:, None] + law / pixels)
     chance = 0.5 * np.sqrt(2 / np.pi) * scatter.sum(1)
@@ -157,19 +157,19 @@ def _misplaced(h, law: np.ndarray, deviation: np.ndarray, summary) -> tuple[int,
 
 
 def _left_out_note(result: FitResult) -> list[str]:
-    """What of a capture that would take too much memory is not in its histograms."""
+    """What was left out of the histograms to save memory."""
     summary = result.summary
     used, given = sum(summary.n_frames), sum(summary.n_frames) + sum(summary.left_out)
     step = min((h.row_stride for h in summary.histograms), default=1)
     if used == given and step == 1:
         return []
     frames = f"{used} of {given} dark frames, spread evenly over each exposure" if used < given else "all dark frames"
-    rows = f", and on one row in {step} of them" if step > 1 else ""
-    return [f"To save memory, this fit rests on {frames}{rows}; the standard errors are those of what was used."]
+    rows = f", and one row in {step} of them" if step > 1 else ""
+    return [f"To save memory, this fit uses {frames}{rows}; the standard errors are for the data used."]
 
 
 def order_note(result: FitResult) -> list[str]:
-    """Means that fall where the exposure grows."""
+    """Means that fall as the exposure grows."""
     for h in result.summary.histograms:
         order = np.argsort(result.summary.exposure_s, kind="stable")
         level = _levels([h])[order]
@@ -184,22 +184,22 @@ def order_note(result: FitResult) -> list[str]:
 
 
 def _warming_note(result: FitResult) -> list[str]:
-    """Means that drift from the first frame of an exposure to the last, where that is most."""
+    """The strongest drift of the mean from the first frame of an exposure to the last."""
     found = [(abs(change), change, e) for e, change in enumerate(_drifts(result)) if abs(change) > WARMING]
     if not found:
         return []
     _, change, e = max(found)
     return [
         f"The dark signal {'rises' if change > 0 else 'falls'} by {abs(change):.0%} from the first frame at"
-        f" {result.summary.exposure_s[e]:g} s to the last: the sensor changes its temperature, or light gets in. Let it"
-        " settle before a series; hsnoise diagnose tells whether the drift matters."
+        f" {result.summary.exposure_s[e]:g} s to the last: the sensor temperature changes, or light gets in. Let the"
+        " sensor settle before a series; hsnoise diagnose shows whether the drift matters."
     ]
 
 
 def _drifts(result: FitResult) -> list[float]:
-    """Relative change of the dark signal over the frames of an exposure, along a straight line; 0 if within chance."""
+    """Relative change of the dark signal over the frames of each exposure, by a straight line; 0 if within chance."""
     summary, drifts = result.summary, []
-    least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # of a signal that may be called one
+    least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # smallest mean that counts as a signal
     black = float(np.mean(black_level(result.params)))
     for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
         pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
@@ -209,7 +209,7 @@ def _drifts(result: FitResult) -> list[float]:
 
 
 def _trend(values: np.ndarray) -> float:
-    """Change from the first to the last of a series along a straight line; 0 if the scatter about it makes as much."""
+    """Change from the first to the last of a series by a straight line; 0 if it is within the scatter about it."""
     time = np.arange(len(values)) - (len(values) - 1) / 2
     slope = float(time @ values / (time @ time))
     left = values - values.mean() - slope * time
@@ -225,12 +225,12 @@ def _light_note(result: FitResult) -> list[str]:
     levels = _levels(result.summary.histograms)
     if len(levels) > 1 and np.ptp(exposures) == 0 and np.ptp(levels) > DRIFT_SIGMA * _noise_dn(result):
         return [
-            f"All exposures are said to be {exposures[0]:g} s, yet their means differ, from {levels.min():.4g} to"
+            f"All exposures are given as {exposures[0]:g} s, but their means range from {levels.min():.4g} to"
             f" {levels.max():.4g} DN: check exposure_s, and whether the sensor warmed up."
         ]
     if _is_lit(result, levels):
         return [
-            f"The frames are {levels.min():.4g} DN bright even at {exposures.min():g} s and hardly brighter at"
+            f"The frames have a mean of {levels.min():.4g} DN even at {exposures.min():g} s and are hardly brighter at"
             f" {exposures.max():g} s: if they saw light, they are flats; pass {setting('kind', 'flat')}."
         ]
     if not rate >= LIGHT_E_PER_S:
@@ -248,7 +248,7 @@ def _levels(histograms: Sequence[RowHistograms]) -> np.ndarray:
 
 
 def _noise_dn(result: FitResult) -> float:
-    """Standard deviation within the rows of the darks, DN, the smallest of all exposures."""
+    """Smallest standard deviation within rows of all dark exposures, DN."""
     h = result.summary.histograms[0]
     pixels = np.maximum(h.row_pixels, 1)
     variance = h.row_sum_of_squares / pixels - (h.row_sum / pixels) ** 2
@@ -256,7 +256,7 @@ def _noise_dn(result: FitResult) -> float:
 
 
 def _is_lit(result: FitResult, levels: np.ndarray) -> bool:
-    """Signal far above a known black level that does not grow with exposure."""
+    """Whether the signal is far above a known black level and does not grow with exposure."""
     summary = result.summary
     if summary.black_level_dn is None or len(levels) < 2 or summary.exposure_s.max() < 1.5 * summary.exposure_s.min():
         return False

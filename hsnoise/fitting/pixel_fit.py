@@ -130,7 +130,7 @@ def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> T
 
 
 def _offset(found: Survey, c: int) -> tuple[float, float]:
-    """Standard deviation of offsets where exposures do not tell them from dark current."""
+    """Standard deviation of offsets where exposures cannot separate them from dark current."""
     if found.shortest is None:
         return 0.0, np.inf
     pattern, low_side = _pattern(found, c)

@@ -33,7 +33,7 @@ from hsnoise.statistics.pixels.transfer import ROUNDING
 NOMINAL = 50.0  # relative deviation of a gain of which nothing is known
 FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
 THERE = 5.0  # standard errors from which an effect of the population is in the model
-ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not tell it
+ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
 IN_OTHER_UNITS = {"dark_current_nonuniformity", "black_shading"}
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
 OF_PIXELS = (
@@ -167,7 +167,7 @@ def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
 
 
 def _fano(pixel: PixelFit) -> tuple[float, float] | None:
-    """Fano factor of the hot pixels, where it is below 1 beyond chance; flats tell it better than ordinary pixels."""
+    """Fano factor of the hot pixels, where it is below 1 beyond chance; flats give it better than ordinary pixels."""
     told = []
     for c, channel in enumerate(pixel.channels):
         t = channel.transfer

@@ -28,7 +28,7 @@ from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
 
 
 class Method(StrEnum):
-    """What a result was fitted by."""
+    """The method of a fit."""
 
     ML = "ml"
     LINE = "line"
@@ -60,15 +60,15 @@ OUTCOMES = {
     Status.CONVERGED: "converged: {}",
     Status.NOT_CONVERGED: "NOT CONVERGED: {}",
     Status.LINE: "the paper's line fit, as asked",
-    Status.LINE_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); the line fit instead",
+    Status.LINE_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); the line fit was used instead",
     Status.TRANSFER: "{}",
-    Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer instead",
-    Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer instead",
+    Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer used instead",
+    Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer used instead",
     Status.MET: "simulated statistics met: {}",
     Status.NOT_MET: "NOT CONVERGED: simulated statistics not met: {}",
 }
 AGREES = "Nothing in these frames contradicts these numbers."
-LOOK_ALIKE = "Compare tells whether frames drawn from them look alike."
+LOOK_ALIKE = "hsnoise compare checks whether frames drawn from them look alike."
 
 
 @dataclass(frozen=True)
@@ -79,16 +79,16 @@ class FitResult:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         names, covariance: fitted parameters and their covariance, in the units of `table`.
         method: "ml", "line", "transfer" where pixels differ, or "synthetic" with effects beyond the paper's.
-        status: how the fit ended; detail: the numbers to it, in words (`outcome` is both in a sentence).
+        status: how the fit ended; detail: its numbers, in words (`outcome` combines both in a sentence).
         iterations: quasi-Newton steps taken.
         log_likelihood: at the estimate, nats (NaN for the line fit, which has none).
         notes: sentences on what the data do not determine, and which capture would.
         summary: the row histograms and photon transfer that were fitted.
-        outliers: fraction of the pixels of each dark exposure that was set apart, as it follows no model; or None.
-        doubts: sentences on what disagrees, and on what is withheld; printed above the table.
-        grave: whether one of them says that a parameter may be wrong; others tell what was set apart.
-        withheld: names of parameters that the frames do not determine: NaN in `table`. In `params` electrons stand for
-            DN then (gain 1 DN/e-), so that darks are still drawn with the right noise.
+        outliers: fraction of the pixels of each dark exposure that was excluded because no model fits it; or None.
+        doubts: sentences on disagreements and withheld parameters, printed above the table.
+        grave: whether a doubt says that a parameter may be wrong; other doubts report what was excluded.
+        withheld: names of parameters that the frames do not determine: NaN in `table`. `params` then has a gain of
+            1 DN/e-, so its electrons are DN and darks are still drawn with the right noise.
         added: effects of `params` that the fit put in because the pixels differ.
         transfer: what pixel transfer found, where pixels differ: `hsnoise.pixel_fit.PixelFit`; else None.
         stack: the frames, for `pixels`.
@@ -114,12 +114,12 @@ class FitResult:
 
     @property
     def trustworthy(self) -> bool:
-        """Whether the fit converged, and nothing that carries a parameter disagrees with the frames."""
+        """Whether the fit converged, and nothing that determines a parameter disagrees with the frames."""
         return self.converged and not self.grave
 
     @property
     def conclusion(self) -> Conclusion:
-        """Whether these numbers may be used, and the first reason against it."""
+        """Whether these numbers can be used, and if not, the first reason."""
         if not self.converged:
             return Conclusion(Light.RED, "Do not use these numbers: the fit did not converge.")
         if not self.doubts:
@@ -135,12 +135,12 @@ class FitResult:
 
     @property
     def further_doubts(self) -> tuple[str, ...]:
-        """The doubts that `conclusion` does not say."""
+        """The doubts that `conclusion` does not mention."""
         return self.doubts[1:] if self.converged else self.doubts
 
     @property
     def has_gain(self) -> bool:
-        """Whether the frames determine the gain; row gain or dark current may be withheld all the same."""
+        """Whether the frames determine the gain; row gain or dark current may still be withheld."""
         return not any(number.name in self.withheld for number in numbers_of(self.params, ["gain"]))
 
     @cached_property
@@ -183,7 +183,7 @@ class FitResult:
         return self.status not in (Status.NOT_CONVERGED, Status.NOT_MET)
 
     def without(self, names: tuple[str, ...]) -> FitResult:
-        """The same fit without some of the effects that it put in by itself; other numbers stay as they are."""
+        """The same fit without some of the effects that it added itself; other numbers do not change."""
         params = self.params
         for name in names:
             params = params.remove(name)
@@ -269,7 +269,7 @@ class FitResult:
 
 @jax.jit
 def _expected(sensor, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[jax.Array, jax.Array]:
-    """Law of the counts averaged over the row gain's prior, and its standard deviation over it [exposure, bin].
+    """Distribution of the counts averaged over the row gain's prior, and its standard deviation [exposure, bin].
 
     sensor: a model and the shares of outliers beside it.
     """
@@ -295,7 +295,7 @@ def _expected(sensor, c: int, summary: Summary, edges_dn, outlier_law) -> tuple[
 
 
 def rounded(value: float, error: float) -> tuple[str, str]:
-    """Value and standard error with the digits that the error leaves meaning to; a word for an error that is none."""
+    """Value and standard error, rounded to significant digits; a word where there is no error."""
     if np.isnan(value):
         return "not determined", ""
     if not (np.isfinite(error) and error > 0):

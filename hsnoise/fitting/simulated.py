@@ -94,7 +94,7 @@ class _Yardstick:
 
     @staticmethod
     def of(problem: Problem, simulator: Simulator, y: np.ndarray) -> _Yardstick:
-        """From draws at y, whose numbers are none of those of the means."""
+        """From draws at y that are not used for the means."""
         found = simulator.reference(problem.at(y), SCATTER_DRAWS, SCATTER_FROM)
         scatter = (found.draws - found.mean) / found.deviation
         equal, first, second = in_threads(
@@ -112,7 +112,7 @@ class _Yardstick:
         return share[:, None] * self.equal * share
 
     def errors(self, slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Standard errors of estimates [number]: half of the draws scatter by weights that are from the other half."""
+        """Standard errors of estimates [number]: the scatter of half of the draws, with weights from the other half."""
         found, prior = [], self.problem.prior
         for equal, others in zip(self.halves, (self.scatter[1::2], self.scatter[::2]), strict=True):
             gain = slopes.T @ (share[:, None] * equal * share)
@@ -130,8 +130,8 @@ class _Yardstick:
 def _without_noise(slopes: np.ndarray) -> np.ndarray:
     """Mean of slopes [draw, number, statistic], shrunk toward zero where draws differ.
 
-    The noise of hundreds of slopes that are zero would pass for information: estimates would stay near the start, and
-    their errors come out too small. The variance of so few draws is pooled: a factor for each number, one for each
+    Otherwise the noise of hundreds of zero slopes would pass for information: estimates would stay near the start, and
+    their errors would be too small. The variance of so few draws is pooled: a factor for each number, one for each
     statistic.
     """
     mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / len(slopes)
@@ -144,7 +144,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
     """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
 
     Gauss-Newton, with Levenberg's damping where a step leads away and Broyden's updates of the derivatives. Statistics
-    that are far off count less (Huber): what the model still lacks must not bend what it can describe.
+    that are far off count less (Huber), so that what the model still lacks does not bias the rest.
     """
     yard = _Yardstick.of(problem, simulator, problem.start)
     here, damping, taken, wanted, fresh, iterations = _first(problem, yard), 0.0, 0, True, False, 0

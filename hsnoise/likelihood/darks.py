@@ -44,7 +44,7 @@ class Block(eqx.Module):
 class RowRule(eqx.Module):
     """Rows sorted into groups of similar gain, and the quadrature that resolves them, for channels of one row_stride.
 
-    A part is one channel in one exposure, told by `channel` and `exposure` [part]; scale [part] spaces the nodes.
+    A part is one channel in one exposure, given by `channel` and `exposure` [part]; scale [part] spaces the nodes.
     edges_dn [part, bin - 1] and outlier_law [part, bin] are those of RowHistograms for the bins of `counts`.
     Without a row gain each part has one row, the sum of all, and there is no layout.
     """
@@ -113,7 +113,7 @@ def evaluate(model: NoiseModel, summary: Summary, rules: Rules, outliers: jax.Ar
 
 
 def dark_laws(model: NoiseModel, exposure_s):
-    """Law of the electrons of each exposure: shared by all channels, gains and black levels."""
+    """Distribution of the electrons of each exposure: shared by all channels, gains and black levels."""
     mean_e = dark_current(model) * jnp.asarray(exposure_s)
     return jax.vmap(poisson_normal_law, (0, None))(mean_e, model["read_noise"].sigma)
 
@@ -166,7 +166,7 @@ _curves.defvjp(_curves_forward, _curves_backward)
 
 
 class Binning(NamedTuple):
-    """What the probabilities of a part's bins stand on: channel, exposure, seconds, law of the electrons, edges."""
+    """What determines a part's bin probabilities: channel, exposure, seconds, electron distribution, edges."""
 
     channel: jax.Array
     exposure: jax.Array
@@ -219,7 +219,7 @@ def log_probability(model: NoiseModel, outliers, at: Binning, beta):
 
 
 def flat_law(model: NoiseModel, flats: FlatMoments) -> FlatLaw:
-    """What the moments of flats stand on."""
+    """What determines the moments of flats."""
     gain = model["gain"].value
     return FlatLaw(
         gain=gain,

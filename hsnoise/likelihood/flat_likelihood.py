@@ -36,7 +36,7 @@ def flat_variance(law: FlatLaw, flats: FlatMoments) -> jax.Array:
 
 
 def without_light(law: FlatLaw, flats: FlatMoments) -> tuple[jax.Array, jax.Array]:
-    """Mean count, DN, and temporal variance, DN^2, without this light [level, channel]: of darks, else by the law."""
+    """Mean count, DN, and temporal variance, DN^2, without this light [level, channel]: of darks, else by the model."""
     row = 1 + law.row_variance[None, :]
     read = ((law.gain * law.read_noise_e) ** 2)[None, :] * row + ROUNDING_VARIANCE
     measured = jnp.isfinite(jnp.asarray(flats.dark_dn))

@@ -1,4 +1,4 @@
-"""Pairs among single flats, each of its own light, such as of a sky at twilight."""
+"""Pairs among single flats in different light, such as a sky at twilight."""
 
 from __future__ import annotations
 

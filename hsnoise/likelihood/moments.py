@@ -11,7 +11,7 @@ from hsnoise.likelihood.summary import RowHistograms, Summary
 from hsnoise.model import NoiseModel
 
 CLAMPED_E = 6.0
-FURTHEST = 3.0  # factor between the gains that means and variances tell: beyond, the means tell something else
+FURTHEST = 3.0  # factor between the gains from means and from variances: beyond, the means do not show the gain
 
 
 def unclip(mean, variance):
@@ -51,7 +51,7 @@ def model_of(
 def start_model(summary: Summary, with_row_gain: bool = True, with_clamp: bool = False) -> NoiseModel:
     """Moment estimates: the photon transfer line of the exposures and the spread of row means.
 
-    with_clamp: the camera subtracts part of the dark signal, so that the means do not tell it.
+    with_clamp: the camera subtracts part of the dark signal, so that the means do not show it.
     """
     if not summary.histograms:
         return _start_of_flats(summary, with_row_gain)
@@ -82,7 +82,7 @@ def start_model(summary: Summary, with_row_gain: bool = True, with_clamp: bool =
 
 
 def _of_one_rate(gain, dark_e, signals):
-    """Gains with which all channels hold the same dark electrons [exposure]: means tell ratios better than variances.
+    """Gains with which all channels hold the same dark electrons [exposure]: means give ratios better than variances.
 
     Coloured rows have no common offset, so that a likelihood that starts far from the means has nowhere to put it.
     """
@@ -145,7 +145,7 @@ def _channel_moments(summary: Summary, histograms: RowHistograms, with_clamp: bo
 
 
 def _clamp_start(exposure_s, level, variance) -> float:
-    """The clamp at which the longest exposure holds CLAMPED_E electrons: the variance tells gain^2 times rate only."""
+    """The clamp at which the longest exposure holds CLAMPED_E electrons: the variance gives only gain^2 times rate."""
     growth, drift = (max(float(np.polyfit(exposure_s, y, 1)[0]), 0.0) for y in (variance, level))
     longest = exposure_s.max()
     gain = np.sqrt(growth * longest / CLAMPED_E)

@@ -1,6 +1,6 @@
 """The one mapping between the numbers of a noise model and the vectors that fits move.
 
-A `Number` says once what there is to know of a number: effect, field, channel, name in tables, unit, bounds, the
+A `Number` holds everything about one number: effect, field, channel, name in tables, unit, bounds, the
 transform to an unconstrained coordinate and the prior on it. `Parameters` are the numbers that one search moves.
 """
 

@@ -1,4 +1,4 @@
-"""Safe mathematics for the likelihood: the law of Poisson plus normal, quadrature weights.
+"""Safe mathematics for the likelihood: the distribution of Poisson plus normal, quadrature weights.
 
 Everything here is meant to run in float64 (callers enable it locally) and differentiates once and twice.
 """
@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 
-GRID_POINTS = 1024  # electron grid of the law; 0.018 standard deviations apart
-GRID_HALF_WIDTH = 9.0  # standard deviations; beyond lies 2e-19 of a normal law
+GRID_POINTS = 1024  # electron grid of the distribution; 0.018 standard deviations apart
+GRID_HALF_WIDTH = 9.0  # standard deviations; beyond lies 2e-19 of a normal distribution
 EXTRA_E = 4.0
 SUM_TERMS = 128  # terms of the sum over photoelectrons: lambda + 9 sqrt(lambda) at lambda = 60
 SADDLE_FROM, SADDLE_TO = 45.0, 60.0  # the sum hands over to the saddle-point density between these means
@@ -89,7 +89,7 @@ def distribution(order: int, x, mean_e, sigma_e, law):
     """H, or for order n > 0 the n-th derivative of the distribution function, at `x` (any shape), and the side.
 
     Quintic Hermite interpolation of `law = poisson_normal_law(mean_e, sigma_e)`; 0 outside its grid. The
-    derivatives are those of the exact law, G_mean(x) = G(x - 1) - G(x) and G_sigma(x) = sigma G''(x), which spares
+    derivatives are exact, not of the table: G_mean(x) = G(x - 1) - G(x) and G_sigma(x) = sigma G''(x), which spares
     the derivative of the table.
     """
     origin, step, nodes = law

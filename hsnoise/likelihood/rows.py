@@ -289,7 +289,7 @@ def _site(posterior, cavity):
 
 
 def _cavity(site, spectrum):
-    """What a row's neighbours and the prior tell of it, Normal(mean, variance), under the sites of all rows."""
+    """What a row's neighbours and the prior say about it, Normal(mean, variance), under the sites of all rows."""
     a, precision = site
     gain = spectrum[None, :] / (1 + precision[:, None] * spectrum[None, :])
     half = gain[:, : gain.shape[1] // 2 + 1]

@@ -1,9 +1,9 @@
 """Summaries of a stack in one pass over its pixels: row histograms of darks, photon transfer of flats.
 
 Both are additive and their size does not depend on the width of the sensor. Given the row gain, the pixels of one row
-and colour are independent draws from one law, so that their histogram is sufficient (darks; flats: see flats.py). Of a
-series whose histograms would fill more than MOST_MIB, as many frames are taken as do not; of few tall frames with wide
-ranges of counts, rows are left out where their number has a divisor.
+and colour are independent draws from one distribution, so their histogram is sufficient (darks; flats: see flats.py).
+If a series' histograms would exceed MOST_MIB, only as many frames as fit are used. If few tall frames have a wide range
+of counts, rows are left out as well, where their number has a divisor.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Summary(eqx.Module):
 
 
 def round_up(size: int, steps: int = 2) -> int:
-    """The next of few sizes, `steps` to each doubling (16, 24, 32, 48 ...), so that captures alike share programs."""
+    """The next of few sizes, `steps` per doubling (16, 24, 32, 48 ...), so that similar captures share programs."""
     power = 1 << max(size - 1, 31).bit_length() - 1
     return next(n for n in range(power, 2 * power + 1, power // steps) if n >= size)
 
@@ -113,7 +113,7 @@ def some_frames(summary: Summary, start: int, stop: int) -> Summary:
 
 
 def every_nth_row(summary: Summary, n: int) -> Summary:
-    """The summary of every n-th row of each colour: a coloured row gain keeps its law, with the spectrum folded."""
+    """The summary of every n-th row of each colour: a coloured row gain keeps its distribution, its spectrum folded."""
 
     def thin(h: RowHistograms) -> RowHistograms:
         parts = {name: getattr(h, name)[:, :, ::n] for name in ("counts", "row_sum", "row_sum_of_squares")}
@@ -171,7 +171,7 @@ def _black_per_channel(stack: FrameStack) -> np.ndarray | None:
 
 
 class _Plan(NamedTuple):
-    """What of the darks goes into the histograms: frames of each exposure, every n-th row; and in how many bins."""
+    """Which darks go into the histograms: frames of each exposure, every n-th row; and in how many bins."""
 
     frames: list[np.ndarray]
     row_step: int
@@ -260,7 +260,7 @@ def _bins(coding: dict[str, tuple[int, int, int]], cfa: str, number: int, white_
 
 
 def _outlier_law(counts: np.ndarray, edges_dn: np.ndarray) -> np.ndarray:
-    """Law of pixels with extra charge: above the median, half exponential near the others, half anywhere.
+    """Distribution of pixels with extra charge: above the median, half exponential near the others, half anywhere.
 
     Thermal generation in silicon leaves an exponential tail of warm pixels; its scale here is OUTLIER_SCALE times the
     half width of the counts below their median, which outliers do not reach. Outliers beyond all bins, of which the
@@ -307,7 +307,7 @@ def _some_rows(frame: np.ndarray, step: int, frames: int) -> np.ndarray:
 
 
 def _coding(sample: np.ndarray, white_level: float | None) -> tuple[int, int, int]:
-    """(first code, codes per bin, bins) of the law that a sample [frame, row, pixel] of one channel comes from.
+    """(first code, codes per bin, bins) for the distribution of a sample [frame, row, pixel] of one channel.
 
     The range is robust (quantiles), so that hot pixels do not stretch it: what lies outside is one open bin.
     """

@@ -53,8 +53,8 @@ def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
 def shrunk_covariance(z: np.ndarray) -> np.ndarray:
     """Covariance [statistic, statistic] of draws z [draw, statistic], shrunk toward its diagonal.
 
-    As far as the draws are too few to know it (Ledoit and Wolf, "A well-conditioned estimator for large-dimensional
-    covariance matrices", J. Multivariate Anal. 88, 2004), LEAST_SHRINKAGE at least.
+    The fewer the draws, the more it is shrunk (Ledoit and Wolf, "A well-conditioned estimator for large-dimensional
+    covariance matrices", J. Multivariate Anal. 88, 2004), by LEAST_SHRINKAGE at least.
     """
     n, d = z.shape
     centred = z - z.mean(0)

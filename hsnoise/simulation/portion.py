@@ -1,4 +1,4 @@
-"""The one cut of a capture: what of it is held in memory, and drawn again and again."""
+"""The one cut of a capture: the part that is held in memory and drawn again and again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Portion:
         """The exposures of some kinds, cut to MOST_PIXELS.
 
         Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
-        darks, for frames that are copies, and for frames too small to tell rows from pixels.
+        darks, for frames that are copies, and for frames too small to separate rows from pixels.
         """
         check_size(stack)
         if "dark" not in stack.kind:

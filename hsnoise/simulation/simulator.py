@@ -39,10 +39,10 @@ def key_for(seed: RandomKey | int, purpose: Purpose) -> RandomKey:
 
 @dataclass(frozen=True)
 class Simulator:
-    """Draws of a model, and of models beside it, as a portion of a capture was taken; measured by their statistics.
+    """Draws of a model, and of models near it, under the conditions of a portion; measured by their statistics.
 
-    Draw `number` has the same random numbers for all models, so that two models differ by what differs in them. What
-    was drawn once is kept.
+    Draw `number` uses the same random numbers for all models, so draws differ only by what differs between the models.
+    Draws are kept for reuse.
 
     Attributes:
         model: whose black level counts are measured from.

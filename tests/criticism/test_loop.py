@@ -312,7 +312,10 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     reasons = {"row_noise": Refusal(Refused.NOT_FITTED), "frame_offset": Refusal(Refused.NO_CHANGE)}
     assert work.first_that_holds(candidates, steps) == (checked, reasons)
     assert tried == ["row_noise", "frame_offset", "column_noise"]
-    assert told == ["row_noise is left out, could not be fitted", "frame_offset is left out, changed nothing by itself"]
+    assert told == [
+        "row_noise is left out, could not be fitted",
+        "frame_offset is left out, made no difference by itself",
+    ]
     assert work.first_that_holds(candidates[:2], steps) == (None, reasons)
 
 
@@ -326,9 +329,9 @@ def test_what_was_tried_in_vain_is_told_with_the_reason():
 
     far, near = ended(7.0), ended(1.2)
     assert far.ending.why == Ended.UNEXPLAINED and near.ending.why == Ended.AS_CHANCE
-    assert "left out: row_noise came out compatible with zero; hot_pixels could not be fitted." in far.ended
-    assert "no effect of the library explains (error 7.00): look at the tails. What was tried" in far.ended
-    assert "error is 1.20, as chance gives. What was tried" in near.ended
+    assert "rejected: row_noise came out compatible with zero; hot_pixels could not be fitted." in far.ended
+    assert "no effect of the library explains (error 7.00): look at the tails. Tried and rejected" in far.ended
+    assert "error is 1.20, within chance. Tried and rejected" in near.ended
 
 
 @pytest.mark.parametrize(
@@ -338,13 +341,13 @@ def test_what_was_tried_in_vain_is_told_with_the_reason():
         (
             Ending(Ended.FINISHED, following=("row_noise", 9.4)),
             "Nothing significant is left",
-            "Nothing significant is left (error 1.20): row_noise would be next, by 9 nats, as chance gives among so"
-            " many.",
+            "Nothing significant is left (error 1.20): row_noise would be next, with 9 nats, within chance among so"
+            " many candidates.",
         ),
         (
             Ending(Ended.NOT_HELD),
-            "Still missing: a or b, but no refit with it held",
-            "Still missing: a or b, but no refit with it held (error 1.20).",
+            "Still missing: a or b, but no refit with it was kept",
+            "Still missing: a or b, but no refit with it was kept (error 1.20).",
         ),
         (
             Ending(Ended.STEPS, 1),
@@ -354,7 +357,7 @@ def test_what_was_tried_in_vain_is_told_with_the_reason():
         (
             Ending(Ended.UNFINISHED),
             "Not finished",
-            "Not finished: whether something is missing was being looked for.",
+            "Not finished: the last diagnosis is still running.",
         ),
     ],
 )
@@ -384,7 +387,7 @@ def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_ou
 
 @pytest.mark.parametrize(
     ("groups", "told"),
-    [((10.0, 14.0), ""), ((1.0, 16.0), ", misfit of all groups together 25 -> 17")],
+    [((10.0, 14.0), ""), ((1.0, 16.0), ", total misfit of all groups 25 -> 17")],
 )
 def test_what_fell_is_told_where_the_error_did_not(groups, told):
     def step(*groups):
@@ -402,4 +405,4 @@ def test_an_addition_is_explained_by_what_it_brought_nearer():
     before = found(("worst", 1.0, 90.0), ("its own", 2.0, -30.0), ("as before", 2.5, 5.0))
     after = found(("worst", 1.1, 89.5), ("its own", 2.9, -1.0), ("as before", 2.5, 5.2))
     (words,) = nearer(before, after)
-    assert words == "its own: measured 3, the model gave 2 (30 standard deviations below), with it 2.9"
+    assert words == "its own: measured 3, the model gave 2 (30 standard deviations below), with the effect 2.9"

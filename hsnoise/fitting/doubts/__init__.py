@@ -1,4 +1,4 @@
-"""What of a fit disagrees with its frames, and what is therefore withheld.
+"""Where a fit disagrees with its frames, and what is therefore withheld.
 
-May import `fitting` and what it may.
+May import `fitting` and whatever that may import.
 """

@@ -17,24 +17,24 @@ APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two 
 
 
 def carries_no_gain(seen: Evidence, method: str) -> bool:
-    """Whether darks of several exposures show no growth of signal, so that their likelihood can not tell the gain.
+    """Whether darks of several exposures show no growth of signal, so that their likelihood cannot determine the gain.
 
-    What it would read it from is the shape of the distribution, which real pixels have for other reasons. Flats tell it
-    without them.
+    The likelihood would infer the gain from the shape of the distribution, which real pixels have for other reasons.
+    Flats determine the gain without darks.
     """
     found, summary = seen.survey, seen.summary
     if method == "line" or not can_be_transferred(found):
         return False
-    if not found.has_exposures:  # flats tell it: a likelihood adds nothing, and rows of real sensors bend it
+    if not found.has_exposures:  # flats give the gain: a likelihood adds nothing, and rows of real sensors bias it
         return summary.flats is not None and has_patterns(found)
-    fell = fall_of(found) is not None  # pedestals that jump so far pass for a signal
+    fell = fall_of(found) is not None  # pedestals that jump this far look like a signal
     if variance_grows(found) and not fell:
         return False
     return not seen.darks.determined and (fell or not _grows(seen.darks))
 
 
 def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
-    """A pooled fit that pixels over time do not contradict; where they do, or it did not converge, theirs instead."""
+    """The pooled fit, or pixel transfer if pixels over time contradict that fit or it did not converge."""
     found, summary = seen.survey, seen.summary
     if summary.flats is not None or not can_be_transferred(found) or not found.has_exposures or full_of_hits(found):
         return result

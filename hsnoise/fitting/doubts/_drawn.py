@@ -1,7 +1,8 @@
-"""The budget under the fitted model beside the measured one: the components that carry a parameter must agree.
+"""The noise budget of the fitted model against the measured one: components that determine a parameter must agree.
 
-Mean and noise of the typical pixel carry black level, dark current, read noise and gain; what rows share in a frame
-carries the row gain. Frames are drawn from the fit as the measured ones were taken, and both are decomposed alike.
+Mean and noise of the typical pixel determine black level, dark current, read noise and gain; the offset that a row
+shares within a frame determines the row gain. Frames are drawn from the fit under the conditions of the capture, and
+both are decomposed in the same way.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.survey import Group, Survey, survey
 
-FRAMES, SHAPE = 8, (128, 256)  # that are drawn of an exposure
-MOST_EXPOSURES = 4  # that are drawn: the shortest, the longest, and between
-NOISE_SHARE = 0.08  # of a noise, by which the two may differ
-LEVEL_NOISES, LEVEL_SHARE = 1.0, 0.1  # of a pixel's noise, and of the signal
-ROW_SHARE, ROW_NOISE = 0.5, 0.02  # of the larger one, and of the variance of a pixel
+FRAMES, SHAPE = 8, (128, 256)  # drawn per exposure
+MOST_EXPOSURES = 4  # drawn: the shortest, the longest, and some between
+NOISE_SHARE = 0.08  # relative difference in noise that is tolerated
+LEVEL_NOISES, LEVEL_SHARE = 1.0, 0.1  # tolerated difference in level: of a pixel's noise, and of the signal
+ROW_SHARE, ROW_NOISE = 0.5, 0.02  # tolerated difference of rows: of the larger one, and of the variance of a pixel
 SIGMAS = 5.0
 
 
 def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
-    """What of the measured noise the fitted model does not draw, in sentences; nothing where there is no gain."""
+    """Sentences on measured noise that the fitted model does not reproduce; none without a gain."""
     if result.stack is None or not result.has_gain or found.shortest is None:
         return
     chosen = _chosen(found)
     if any(plane.narrow_dn is not None for i in chosen for plane in found.groups[i].planes):
-        return  # rounding, which two noises below a count share unequally, is most of it
+        return  # rounding dominates noise below a count, and affects the two unequally
     drawn = _drawn(result.params, result.stack, [found.groups[i].exposure_s for i in chosen])
     pairs = [(found.groups[i], group) for i, group in zip(chosen, drawn.groups, strict=True)]
     for c, channel in enumerate(found.channels):
@@ -46,7 +47,7 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
 
 
 def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Survey:
-    """A survey of darks drawn from the model; of one size, so that a process compiles their drawing once."""
+    """A survey of darks drawn from the model, all of one size so that a process compiles the sampling once."""
     key = jax.random.key(0)
     clean = np.broadcast_to(np.float32(0), (FRAMES, *SHAPE))
     window = _middle(stack)
@@ -66,7 +67,7 @@ def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Su
 
 
 def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:
-    """Where drawn frames lie on the sensor; None of a smaller one."""
+    """Where drawn frames lie on the sensor; None if the sensor is smaller than they are."""
     free = [size - drawn for size, drawn in zip(stack.shape, SHAPE, strict=True)]
     if min(free) < 0:
         return None
@@ -75,7 +76,7 @@ def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:
 
 
 def _chosen(found: Survey) -> list[int]:
-    """Which groups are drawn: darks of several frames, evenly over their exposures."""
+    """The groups to draw: darks of several frames, evenly spread over their exposures."""
     repeated = [i for i, group in enumerate(found.groups) if group.kind == "dark" and group.n_frames > 1]
     repeated.sort(key=lambda i: found.groups[i].exposure_s)
     places = np.linspace(0, len(repeated) - 1, min(MOST_EXPOSURES, len(repeated))).round().astype(int)
@@ -83,20 +84,20 @@ def _chosen(found: Survey) -> list[int]:
 
 
 def _noise(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
-    """By how much temporal noise is off, and the sentence on it."""
+    """How far temporal noise is off, with a sentence about it."""
     for group, drawn in pairs:
         (measured, error), (model, chance) = _typical(group, c), _typical(drawn, c)
         off = abs(np.sqrt(measured / max(model, 1e-12)) - 1)
         if off > NOISE_SHARE and abs(measured - model) > SIGMAS * np.hypot(error, chance):
             yield (
                 off,
-                f"The noise of the pixels{of} at {seconds(group.exposure_s)} is {np.sqrt(measured):.4g} DN, that of"
-                f" frames drawn from the fit {np.sqrt(model):.4g} DN: gain and read noise describe another sensor.",
+                f"The pixel noise{of} at {seconds(group.exposure_s)} is {np.sqrt(measured):.4g} DN, but"
+                f" {np.sqrt(model):.4g} DN in frames drawn from the fit: gain or read noise is wrong.",
             )
 
 
 def _level(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
-    """By how much the typical pixel's level is off, and the sentence on it."""
+    """How far the typical pixel's level is off, with a sentence about it."""
     lowest = min(_median(group, c) for group, _ in pairs)
     for group, drawn in pairs:
         level, model, noise = _median(group, c), _median(drawn, c), np.sqrt(_typical(group, c)[0])
@@ -104,13 +105,14 @@ def _level(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[
         if off > max(LEVEL_NOISES * noise, LEVEL_SHARE * (level - lowest)):
             yield (
                 off / max(noise, 1e-6),
-                f"The level of the typical pixel{of} at {seconds(group.exposure_s)} is {level:.5g} DN, in frames drawn"
-                f" from the fit {model:.5g} DN: its dark signal does not grow with exposure as a dark current does.",
+                f"The level of the typical pixel{of} at {seconds(group.exposure_s)} is {level:.5g} DN, but"
+                f" {model:.5g} DN in frames drawn from the fit: its dark signal does not grow with exposure as a dark"
+                " current does.",
             )
 
 
 def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[float, str]]:
-    """By how much that which rows share in a frame is off, and the sentence on it."""
+    """How far the noise that a row shares within a frame is off, with a sentence about it."""
     for group, drawn in pairs:
         one, other = (_shared_by_rows(side, c) for side in (group, drawn))
         off, noise = abs(one.variance_dn2 - other.variance_dn2), _typical(group, c)[0]
@@ -118,13 +120,14 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
         if off > max(ROW_NOISE * noise, error, ROW_SHARE * max(one.variance_dn2, other.variance_dn2)):
             yield (
                 off / max(noise, 1e-6),
-                f"What a row{of} shares in a frame at {seconds(group.exposure_s)} is {_rms(one):.3g} DN, in frames"
-                f" drawn from the fit {_rms(other):.3g} DN: the row gain is wrong, or rows have noise of another kind.",
+                f"The row noise within frames{of} at {seconds(group.exposure_s)} is {_rms(one):.3g} DN, but"
+                f" {_rms(other):.3g} DN in frames drawn from the fit: the row gain is wrong, or rows have another kind"
+                " of noise.",
             )
 
 
 def _typical(group: Group, c: int) -> tuple[float, float]:
-    """Temporal variance of the pixels that are no outliers, DN^2, and its standard error."""
+    """Temporal variance of the pixels without outliers, DN^2, and its standard error."""
     variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
     kept = without_outliers(variance, group.n_frames)
     return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))

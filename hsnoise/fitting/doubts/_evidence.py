@@ -1,4 +1,4 @@
-"""What the checks of a fit rest on: the survey of the frames, and what pixels over time say, measured once."""
+"""The basis for the checks of a fit: the survey of the frames, and pixels over time, each measured once."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ class Evidence:
 
     @cached_property
     def darks(self) -> PixelFit:
-        """Pixel transfer of the darks, whatever the flats say."""
+        """Pixel transfer of the darks, ignoring the flats."""
         return measure(self.survey, replace(self.summary, flats=None))

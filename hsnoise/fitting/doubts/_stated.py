@@ -1,4 +1,4 @@
-"""What headers and the user said, tested against the frames: gain, black and white level, shutter, colours."""
+"""Values from headers and the user, tested against the frames: gain, black and white level, shutter, colours."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from hsnoise.frames.mosaics import looks_like_a_mosaic, mosaic_in_words
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.survey import Group
 
-BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last of the signal at the shortest exposure
-FEWEST_PILED, PILED = 20, 3.0  # pixels at the highest count; as many times those of the counts below it
-NOISY_DN = 1.0  # counts of narrower noise pile up anyway
-ROW_SIGMAS, TOGETHER = 6.0, 0.3  # of what a row shares, that the next one has, too
+BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last: share of the signal at the shortest exposure
+FEWEST_PILED, PILED = 20, 3.0  # pixels at the highest count, and how many times as many as just below it
+NOISY_DN = 1.0  # with less noise, counts pile up anyway
+ROW_SIGMAS, TOGETHER = 6.0, 0.3  # the last: share of a row's noise that continues in the next row
 
 
 def stated(result: FitResult, seen: Evidence) -> Iterator[str]:
-    """All that was given and that the frames contradict."""
+    """All given values that the frames contradict."""
     gain = None if result.stack is None else result.stack.stated_gain
     if gain is not None and gain.certain:
         yield from header_gain(result)
@@ -30,7 +30,7 @@ def stated(result: FitResult, seen: Evidence) -> Iterator[str]:
 
 
 def header_gain(result: FitResult) -> Iterator[str]:
-    """A gain that the header states, against the fitted one; where it may be a nominal one, the frames are believed."""
+    """The header's gain against the fitted one; where the header's may be nominal, the frames are trusted."""
     if result.stack is None or not result.has_gain:
         return
     rows = list(result.rows_of("gain").values())
@@ -39,7 +39,7 @@ def header_gain(result: FitResult) -> Iterator[str]:
 
 
 def _black_level(result: FitResult, seen: Evidence) -> Iterator[str]:
-    """A black level that was given, against the level of the darks without signal."""
+    """A given black level, against the level of the darks without signal."""
     given = result.summary.black_level_dn
     if given is None or result.transfer is None and result.method != Method.ML or not seen.survey.has_exposures:
         return
@@ -51,17 +51,17 @@ def _black_level(result: FitResult, seen: Evidence) -> Iterator[str]:
         clipped = max(g.clipped_share[c] for g in darks)
         if clipped > 1e-4 or not np.isfinite(error):
             continue
-        back = EXTRAPOLATED * abs(channel.values[2]) * shortest  # the median of growing pixels is no straight line
+        back = EXTRAPOLATED * abs(channel.values[2]) * shortest  # the median of pixels does not grow linearly
         if abs(level - given[c]) > max(BLACK_SIGMAS * error, BLACK_DN, back):
             of = "" if channel.name == "mono" else f" of {channel.name}"
             yield (
-                f"The black level{of} was given as {given[c]:.4g} DN; the darks without signal lie at {level:.4g} ±"
-                f" {error:.2g} DN. Leave it out, and it is fitted."
+                f"The black level{of} was given as {given[c]:.4g} DN, but darks without signal lie at {level:.4g} ±"
+                f" {error:.2g} DN. Omit it to have it fitted."
             )
 
 
 def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
-    """Counts that end below the white level, or go on above it."""
+    """Counts that saturate below the white level, or exceed it."""
     given = result.summary.white_level_dn
     noisy = [group for group in seen.survey.groups if group.n_frames > 1 and group.noise_dn > NOISY_DN]
     if not noisy:
@@ -72,8 +72,8 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     above = 0.0 if given is None else float((highest > given).mean())
     if above > 0:
         yield (
-            f"{100 * above:.2g} % of the pixels hold counts above the white level, which was given as {given:g} DN, up"
-            f" to {top:g}: it is higher. Leave it out, or give {setting('white_level', top)}."
+            f"{100 * above:.2g} % of the pixels have counts above the given white level of {given:g} DN, up to"
+            f" {top:g}. Omit the white level, or give {setting('white_level', top)}."
         )
         return
     piled = int((highest == top).sum())
@@ -81,13 +81,11 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
     if piled < max(FEWEST_PILED, PILED * below) or top >= (seen.survey.full_scale_dn if given is None else given) - 1:
         return
     what = "no white level was given" if given is None else f"the white level was given as {given:g} DN"
-    yield (
-        f"{piled} of the pixels looked at end at a count of {top:g} DN, and {what}: give {setting('white_level', top)}."
-    )
+    yield (f"{piled} of the sampled pixels saturate at {top:g} DN, but {what}: give {setting('white_level', top)}.")
 
 
 def _highest(group: Group, moving: list[np.ndarray]) -> np.ndarray:
-    """The highest count of each pixel that is not stuck."""
+    """The highest count of each pixel, without stuck pixels."""
     of = [np.concatenate([p.halves.highest for p in group.of(c)])[kept] for c, kept in enumerate(moving)]
     return np.concatenate(of).astype(np.float64)
 
@@ -103,7 +101,7 @@ def _mosaic(result: FitResult, seen: Evidence) -> Iterator[str]:
 
 
 def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:
-    """Rows that share noise with the next one, where the shutter was said to be a global one."""
+    """Rows that share noise with the next row, although the shutter was given as global."""
     planes = [plane for group in seen.survey.repeated_darks for plane in group.planes]
     if result.summary.shutter != "global" or not planes:
         return
@@ -114,6 +112,6 @@ def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:
     if together.variance_dn2 > max(ROW_SIGMAS * together.chance_dn2, TOGETHER * shared.variance_dn2):
         correlation = together.variance_dn2 / shared.variance_dn2
         yield (
-            f"What a row shares in a frame goes on in the next row (correlation {correlation:.2f}), which a"
-            " global shutter does not do: the shutter is a rolling one, or the rows have noise of another kind."
+            f"The noise of a row continues in the next row (correlation {correlation:.2f}), which a global shutter does"
+            " not cause: the shutter is rolling, or the rows have another kind of noise."
         )

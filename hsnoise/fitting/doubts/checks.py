@@ -1,8 +1,8 @@
-"""No number without a check: what of a fit disagrees with its frames, in sentences, and what is withheld.
+"""No number without a check: sentences on where a fit disagrees with its frames, and what is withheld.
 
-`_drawn`: the components that carry a parameter, measured and in frames drawn from the fit. `_stated`: what headers and
-the user said (gain, black and white level, shutter, colours). `_choice`: which of two fits to believe. Here: a gain
-that no growth of signal carries, frames, lines and pixels that are no measurement, and the order of all.
+`_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
+headers and the user (gain, black and white level, shutter, colours). `_choice`: which of two fits to believe. Here: a
+gain without growth of signal to support it, frames and pixels that measure nothing, and the order of all checks.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
 
 __all__ = ["Evidence", "carries_no_gain", "checked", "confirmed"]
 
-OPEN = 1.0  # error of a gain over itself from which nothing is known of it
-ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks so long that their signal shows."
+OPEN = 1.0  # relative error of a gain from which it counts as unknown
+ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks long enough for their signal to show."
 OFF_LINE = 3.0  # chi2 per degree of freedom
-MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is told; from which a fit is not trusted
+MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
 MANY_HOT = 0.15  # share of pixels
-STATIC_SHARE = 0.03  # of the temporal variance that a pooled fit takes for noise
+STATIC_SHARE = 0.03  # static variance that a pooled fit mistakes for noise, over the temporal variance
 
 
 def checked(result: FitResult, seen: Evidence) -> FitResult:
-    """The result with its doubts, and the notes of what it does not determine."""
+    """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
     checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
@@ -63,7 +63,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
 
 
 def _without_open_gain(result: FitResult) -> FitResult:
-    """A pooled fit that leaves the gain open altogether, with all that is in electrons withheld."""
+    """The result; if a pooled fit leaves the gain unknown, with all parameters in electrons withheld."""
     gains = list(result.rows_of("gain").values())
     if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error, _ in gains):
         return result
@@ -78,7 +78,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
     pixel: PixelFit | None = result.transfer
     if pixel is None:
         read_dn = float(np.mean(result.params["gain"].value)) * float(result.params["read_noise"].sigma)
-        yield f"The gain is not determined: nothing in these darks tells it. Read noise is {read_dn:.4g} DN. {ADD}"
+        yield f"The gain is not determined: these darks do not show it. Read noise is {read_dn:.4g} DN. {ADD}"
         return
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
     error = float(np.sqrt(np.mean([c.covariance[1, 1] for c in pixel.channels]) / len(pixel.channels)))
@@ -89,13 +89,13 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         low = max(min(t.hot_gain - 2 * t.hot_error for t in bounds), 0.0)
         high = 2 * max(t.hot_gain + 2 * t.hot_error for t in bounds)
         why = (
-            "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2: it"
-            f" lies between {low:.3g} and {high:.3g} DN/e-"
+            "only hot pixels grow with exposure, and their noise is below Poisson by an unknown factor of 1 to 2. The"
+            f" gain lies between {low:.3g} and {high:.3g} DN/e-"
         )
     elif not found.has_exposures:
         why = "darks of one exposure show no growth of signal"
     else:
-        why = "the dark signal of ordinary pixels does not grow with exposure by enough"
+        why = "the dark signal of ordinary pixels does not grow enough with exposure"
     yield (
         f"The gain is not determined: {why}. {_named_noise(found)} is {read_dn:.4g} ±"
         f" {error / max(2 * read_dn, 1e-9):.2g} DN. {ADD}"
@@ -103,7 +103,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
 
 
 def _named_noise(found: Survey) -> str:
-    """What the noise without signal is: with one exposure, that exposure's own, dark shot noise included."""
+    """What to call the noise without signal; with one exposure it includes that exposure's dark shot noise."""
     shortest_s = found.shortest.exposure_s if found.shortest is not None else 0.0
     if found.has_exposures or shortest_s == 0:
         return "Read noise"
@@ -111,7 +111,7 @@ def _named_noise(found: Survey) -> str:
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
-    """Where pixels leave the line, and flats and darks disagree."""
+    """Where pixels leave the photon transfer line, and where flats and darks disagree."""
     pixel = result.transfer
     if pixel is None:
         return
@@ -122,15 +122,15 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
             continue  # the gain does not come from there
         if t.chi2 > OFF_LINE * max(t.dof, 1):
             yield (
-                f"The variance of the pixels{of} leaves the straight line over their level (chi2 {t.chi2:.0f} for"
-                f" {t.dof:.0f} degrees of freedom): telegraph noise, a bent response, or charge that spreads."
+                f"The variance of the pixels{of} is not linear in their level (chi2 {t.chi2:.0f} for {t.dof:.0f}"
+                " degrees of freedom): telegraph noise, a nonlinear response, or charge that spreads."
             )
     if pixel.flats is not None:
         yield from _flats_against_darks(pixel)
 
 
 def _moved_pedestals(result: FitResult) -> Iterator[str]:
-    """Pedestals that moved: the gain does not rest on them then."""
+    """Pedestals that moved; the gain then does not depend on them."""
     pixel = result.transfer
     for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
         t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
@@ -138,7 +138,7 @@ def _moved_pedestals(result: FitResult) -> Iterator[str]:
             e = int(np.argmax(t.moved))
             yield (
                 f"The pedestal{of} moved by {t.pedestal_dn[e]:+.2g} DN at {t.classes.exposure_s[e]:g} s, more than its"
-                " frames differ: the gain comes from the differences between pixels there."
+                " frames differ: the gain at this exposure comes from differences between pixels."
             )
 
 
@@ -151,46 +151,46 @@ def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
         if abs(flat - t.gain) > max(APART_SIGMAS * np.hypot(error, t.gain_error), 2 * APART_SHARE * flat):
             yield (
                 f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
-                " them is not what it is taken for (another gain setting, a bent response, moving pedestals)."
+                " them is wrong (another gain setting, a nonlinear response, moving pedestals)."
             )
 
 
 def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
-    """Darks of which no exposure has two frames: nothing tells whether pixels differ."""
+    """Darks without two frames at any exposure, which cannot show whether pixels differ."""
     if found.darks and all(g.n_frames < 2 for g in found.darks):
         yield (
-            "Each exposure has one dark frame, so that differences between pixels cannot be told from noise; with"
-            " them, gain and read noise are wrong by large factors. Take two frames of each exposure, better eight."
+            "Each exposure has one dark frame, so differences between pixels cannot be distinguished from noise; they"
+            " can make gain and read noise wrong by large factors. Take two frames of each exposure, better eight."
         )
 
 
 def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
-    """Clipping of pixels whose noise differs: its correction takes the noise of a class for one."""
+    """Clipping of pixels whose noise differs: the correction assumes one noise for all pixels of a class."""
     if result.transfer is None or not result.has_gain:
         return
     for c, _ in enumerate(found.channels):
         clipped = max((group.clipped_share[c] for group in found.repeated_darks), default=0.0)
         if clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
             yield (
-                f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: what clipping takes"
-                " off is not known well, and gain and read noise may be off by several percent. Raise the black level."
+                f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: the correction for"
+                " clipping is uncertain, and gain and read noise may be off by several percent. Raise the black level."
             )
             return
 
 
 def _falling(result: FitResult, found: Survey) -> Iterator[str]:
-    """A level that falls with exposure by more than the noise of a pixel: swapped exposures, or a subtracted dark."""
+    """A level that falls with exposure by more than a pixel's noise: swapped exposures, or a subtracted dark."""
     fallen = fall_of(found)
     if fallen is not None:
         one, other, fall = fallen
         yield (
-            f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than the"
-            " noise of a pixel: exposures are swapped, or the camera subtracts its dark signal."
+            f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than a"
+            " pixel's noise: exposures are swapped, or the camera subtracts its dark signal."
         )
 
 
 def _outlier_share(result: FitResult) -> float:
-    """Largest share of pixels that were set apart for an outlier."""
+    """Largest share of pixels that were excluded for an outlier."""
     channels = result.transfer.channels if result.transfer is not None else ()
     return max((float(c.transfer.classes.outlier_share.max()) for c in channels if c.transfer is not None), default=0.0)
 
@@ -201,20 +201,20 @@ def _many_hot(result: FitResult) -> Iterator[str]:
     if share > MANY_HOT:
         yield (
             f"{100 * share:.2g} % of the pixels came out as hot: dark currents are not log-normal with a few hot pixels"
-            " above. Their mean over all pixels is right, their distribution in the model is rough."
+            " above. The model's mean over all pixels is right, but its distribution is rough."
         )
 
 
 def _outliers(result: FitResult) -> Iterator[str]:
-    """Pixels that were set apart because some frame of theirs holds an outlier."""
+    """Pixels that were excluded because they have an outlier in some frame."""
     pixel = result.transfer
     for channel in pixel.channels if pixel is not None else ():
         share = 0.0 if channel.transfer is None else float(channel.transfer.classes.outlier_share.max())
         if share > MANY_OUTLIERS:
             of = "" if channel.name == "mono" else f" of {channel.name}"
             yield (
-                f"{100 * share:.2g} % of the pixels{of} hold an outlier in some frame (cosmic rays, telegraph jumps):"
-                " they were set apart."
+                f"{100 * share:.2g} % of the pixels{of} have an outlier in some frame (cosmic rays, telegraph jumps):"
+                " the fit excludes them."
             )
 
 
@@ -224,7 +224,7 @@ def _of_flats(result: FitResult) -> list[str]:
 
 
 def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
-    """What read noise is at most, where it is narrower than a count."""
+    """An upper limit of read noise that is narrower than a count."""
     planes = found.shortest.planes if found.shortest is not None else ()
     bounds = [plane.narrow_dn[1] for plane in planes if plane.narrow_dn]
     if not bounds or not np.isfinite(max(bounds)):
@@ -238,7 +238,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
 
 
 def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
-    """Static structure that a fit by pooled histograms takes for noise."""
+    """Static structure that a fit by pooled histograms mistakes for noise."""
     if result.method == Method.TRANSFER:
         return
     worst = 0.0
@@ -250,6 +250,7 @@ def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
     known = {"dark_signal_nonuniformity", "dark_current_nonuniformity", "hot_pixels"} & set(result.params.names)
     if worst > STATIC_SHARE and not known:
         yield (
-            f"Pixels differ: what stays in them is up to {worst:.0%} of what changes, and this fit takes it for noise."
-            " Its gain, dark current and read noise may be off by as much; hsnoise improve tells what is missing."
+            f"Pixels differ: their static variance is up to {worst:.0%} of the temporal one, and this fit mistakes it"
+            " for noise. Gain, dark current and read noise may be off by as much; hsnoise improve finds what is"
+            " missing."
         )
