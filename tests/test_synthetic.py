@@ -21,9 +21,9 @@ STATISTICS, NUMBERS = 60, 3
 SLOPES = np.random.default_rng(0).standard_normal((STATISTICS, NUMBERS))
 
 
-def linear_fit(weight):
-    """Covariance that weights claim, and the way from statistics to the score."""
-    return np.linalg.inv(SLOPES.T @ weight @ SLOPES), SLOPES.T @ weight
+def linear_fit(prior):
+    """Covariance that equal weights claim beside a prior, the way from statistics to the score, and the prior."""
+    return np.linalg.inv(SLOPES.T @ SLOPES + np.diag(prior)), SLOPES.T, prior
 
 
 def draws(covariance, seed):
@@ -31,19 +31,24 @@ def draws(covariance, seed):
     return z - z.mean(0)
 
 
-def test_errors_of_right_weights_stay():
-    covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean([as_scattered(covariance, gain, draws(np.eye(STATISTICS), s)) for s in range(40)], 0)
-    assert np.sqrt(np.diagonal(widened) / np.diagonal(covariance)) == pytest.approx(1.0, abs=0.15)
+def growth_of_errors(true, prior):
+    """Standard errors as draws show them over those that equal weights claim [number], mean over many fits."""
+    claimed, *rest = linear_fit(prior)
+    scattered = np.mean([as_scattered(claimed, *rest, draws(true, s)) for s in range(40)], 0)
+    return np.sqrt(np.diagonal(scattered) / np.diagonal(claimed))
+
+
+@pytest.mark.parametrize("held", [0.0, 60.0, 1e6])
+def test_errors_of_right_weights_stay(held):
+    """However firmly a prior holds the first number: 60 is as much as the statistics tell of it."""
+    assert growth_of_errors(np.eye(STATISTICS), np.array([held, 0.0, 0.0])) == pytest.approx(1.0, abs=0.1)
 
 
 def test_errors_of_weights_that_hide_a_correlation_are_widened():
     together = SLOPES[:, 0] / np.linalg.norm(SLOPES[:, 0])
     true = np.eye(STATISTICS) + 8.0 * np.outer(together, together)  # the first number's own direction scatters thrice
-    covariance, gain = linear_fit(np.eye(STATISTICS))
-    widened = np.mean([as_scattered(covariance, gain, draws(true, s)) for s in range(40)], 0)
-    ratio = np.sqrt(np.diagonal(widened) / np.diagonal(covariance))
-    assert 2.4 < ratio[0] < 3.2 and np.all(ratio >= 1.0)
+    ratio = growth_of_errors(true, np.zeros(NUMBERS))
+    assert 2.4 < ratio[0] < 3.2 and np.all(ratio > 0.95)
 
 
 TRUTH = hsnoise.cameras.canon_5d3().add(RowNoise(1.5))
