@@ -144,17 +144,19 @@ def _found(search: Search, fit, draws: int, seed: int) -> tuple[Diagnosis, list[
         judged = search.closer(judged)
     if _leaves_something(judged[0], evidence):  # one effect alone does not do: which others could, and closer again
         judged = search.closer(search.partners(judged))
-    judged, estimate = search.on_its_side(judged)
+    judged, freed = search.with_its_base(judged)
     if _leaves_something(judged[0], evidence):
         pair = search.best_pair(judged)
     ranking = [one.candidate(evidence) for one in judged]
-    if estimate is not None:
-        ranking[0] = replace(ranking[0], effect=estimate)
     with_each = {one.of.name: one.of.distribution(one.amplitude, evidence.null) for one in judged[:1]}
+    if freed is not None:
+        ranking[0] = replace(ranking[0], effect=freed.effect)
+        if freed.misfit <= judged[0].misfit:
+            with_each[ranking[0].name] = freed.distribution
     found = verdict_of(ranking, pair, evidence, with_each)
     if _may_be_a_clamp(found, search.bench, evidence):
         clamp = clamp_by_likelihood(fit, search.bench, evidence)
-        if clamp is not None:
+        if clamp is not None and clamp[0].misfit < found.ranking[0].misfit:
             candidate, left, distribution = clamp
             others = [c for c in ranking if c.name != CLAMP]
             found = verdict_of(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, with_each)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from hsnoise.criticism import sentences
@@ -35,9 +33,9 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     return sentences.frames_apart(kept, held_out.n_frames)
 
 
-def log_likelihood(model: NoiseModel, portion: Portion, seed: int, tick: Callable[[], None] = lambda: None) -> float:
+def log_likelihood(model: NoiseModel, portion: Portion, seed: int, purpose: Purpose = Purpose.HELD_OUT) -> float:
     """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats."""
-    simulator = Simulator(model, portion, key_for(seed, Purpose.HELD_OUT), tick)
+    simulator = Simulator(model, portion, key_for(seed, purpose))
     own = simulator.reference(model, DRAWS)
     z = own.z(simulator.measured.values)
     return float(own.distribution.log_density(z) - np.log(own.deviation).sum())

@@ -41,6 +41,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits
 from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Purpose
 
 log = logging.getLogger(__name__)
 
@@ -239,14 +240,14 @@ class _Work:
             stage = _stage(f"adding {effect.name}" if is_first else "the same on the other side of the gain", steps)
             self.say(stage)
             try:
-                fits.append(_fit_with(effect, steps, self.fitted, self.portion, self.counter(stage)))
+                fits.append(_fit_with(effect, steps, self, self.counter(stage)))
             except (RuntimeError, ValueError) as error:
                 self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
         if not fits:
             return None
         if len(fits) == 1:
             return self.step(fits[0], candidate.name, steps)
-        values = [log_likelihood(one.params, self.portion, self.seed) for one in fits]
+        values = [log_likelihood(one.params, self.portion, self.seed, Purpose.SIDE) for one in fits]
         step = self.step(fits[int(np.argmax(values))], candidate.name, steps)
         return replace(step, ahead=abs(values[0] - values[1]))
 
@@ -287,15 +288,13 @@ def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
     return effect, *(on_side(effect, side) for side in Side if side != side_of(effect))
 
 
-def _fit_with(
-    effect: AbstractEffect, steps: list[Step], fitted: FrameStack, portion: Portion, tick: Callable[[], None]
-) -> FitResult:
+def _fit_with(effect: AbstractEffect, steps: list[Step], work: _Work, tick: Callable[[], None]) -> FitResult:
     """A fit of the last model and one effect more; it starts from the last fit by likelihood if possible."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != Method.SYNTHETIC), None)
     if base is None or any(one.in_likelihood and one.name not in base.params for one in model):
-        return fit(fitted, model=model)
-    return fit_synthetic(base, portion, model, tick=tick)
+        return fit(work.fitted, model=model)
+    return fit_synthetic(base, work.portion, model, seed=work.seed, tick=tick)
 
 
 def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,21 @@ STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
 NEARBY_ERROR = 0.02  # of shifts close to the capture
 TINY = 1e-3  # a parameter of the base that is zero
+
+
+class WithBase(NamedTuple):
+    """An effect with the base fitted to it.
+
+    score: log-likelihood ratio, nats; misfit: normal score of the worst group; start, effect: before and after;
+    distribution: of the statistics there.
+    """
+
+    score: float
+    misfit: float
+    start: AbstractEffect
+    effect: AbstractEffect
+    distribution: Gaussian
+
 
 Step = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -59,7 +75,7 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
     return max(pair, again, key=lambda one: one.score)
 
 
-def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple[float, AbstractEffect]:
+def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> WithBase:
     """Log-likelihood ratio of an effect, and the effect, with its parameters and the base brought close to the capture.
 
     Unlike fingerprints on a base that the effect has biased, it separates variants of one effect that differ little. It
@@ -90,8 +106,8 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> tuple
             break
     there = turned.put(model, y)
     numbers = range(min(NEARBY_DRAWS, len(bench.base.draws)))
-    shifts = bench.shifts([(there, number) for number in numbers])
-    return evidence.score(_nearby(shifts, own)), there[effect.name]
+    nearby = _nearby(bench.shifts([(there, number) for number in numbers]), own)
+    return WithBase(evidence.score(nearby), evidence.misfit(nearby), effect, there[effect.name], nearby)
 
 
 def _limited(step: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from hsnoise.criticism.ranking import (
     judge,
     judge_all,
 )
-from hsnoise.criticism.refine import refined, refined_pair, with_base
+from hsnoise.criticism.refine import WithBase, refined, refined_pair, with_base
 from hsnoise.effects import AbstractEffect, Maker
 
 GLANCE, GLANCE_DETAILS = (1.0,), 2  # amplitudes and details at which all candidates are drawn,
@@ -104,25 +104,26 @@ class Search:
         (of,) = self.bench.fingerprints({effect.name: (maker, AROUND)}, CLOSE_DETAILS)
         return judge(of, self.evidence, CLOSE)
 
-    def on_its_side(self, judged: list[Judged]) -> tuple[list[Judged], AbstractEffect | None]:
-        """The first candidate before or after the gain, where it describes the capture better, the base fitted to it.
+    def with_its_base(self, judged: list[Judged]) -> tuple[list[Judged], WithBase | None]:
+        """The first candidate with the base fitted to it: on its side of the gain, where it has sides.
 
-        Random details confound the side of the gain, and the base fit has already absorbed part of the effect. The
-        estimate with another base is the better one, too.
+        Random details confound the side, and the base fit has already absorbed part of the effect: with the base free,
+        it leaves less of the statistics, and the estimate is better. Without sides, only where something is left.
         """
         first = judged[0]
         effect = first.candidate(self.evidence).effect
-        if first.score <= self.evidence.least or not has_sides(effect):
+        if first.score <= self.evidence.least or not (has_sides(effect) or first.misfit > rules.MISFIT_LEFT):
             return judged, None
-        sides = [on_side(effect, side) for side in Side]
-        found = [(*with_base(one, self.bench, self.evidence), one) for one in sides]
-        _, estimate, start = max(found, key=lambda one: one[0])
-        closer = self.drawn_close(start)
+        variants = [on_side(effect, side) for side in Side] if has_sides(effect) else [effect]
+        found = [with_base(one, self.bench, self.evidence) for one in variants]
+        best = max(found, key=lambda one: one.score)
+        closer = self.drawn_close(best.start) if has_sides(effect) else first
         # Scores of many draws are lower: in few, rare counts seem to scatter less. Far lower, the search went astray.
         if closer.score <= NEAR * first.score:
             return judged, None
+        closer = replace(closer, misfit=min(closer.misfit, best.misfit))
         again = _best_first([closer, *judged[1:]])
-        return again, estimate if again[0] is closer else None
+        return again, best if again[0] is closer else None
 
     def best_pair(self, judged: list[Judged]) -> Pair | None:
         """Two effects that explain the capture together: of those that come nearest, refined one after the other."""

@@ -28,6 +28,7 @@ class Purpose(enum.StrEnum):
     DIAGNOSE = "diagnose"
     CHANCE = "chance"
     REFIT = "refit"
+    SIDE = "side of the gain"
     HELD_OUT = "held out"
     LINES = "lines"
 
