@@ -16,7 +16,8 @@ from hsnoise.simulation.simulator import Simulator
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
 SLOPE_DRAWS = 2
-STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off
+STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off;
+FAR_REACH = 30.0  # of the row gain so many: rows that have another kind of noise give it to rows without any
 BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
 
 
@@ -100,8 +101,13 @@ class Bench:
     def slopes(self) -> np.ndarray:
         """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
         moved = _moved_models(self.model)
-        steps = np.full(len(moved), 1 / REACH)
+        of_rows = [np.any(self._row_gain_of(one) != self._row_gain_of(self.model)) for one in moved]
+        steps = 1 / np.where(of_rows, FAR_REACH, REACH)
         return self.simulator.slopes(self.model, moved, steps, SLOPE_DRAWS).mean(0) / self.base.deviation
+
+    @staticmethod
+    def _row_gain_of(model: NoiseModel) -> np.ndarray:
+        return np.asarray(model["row_gain"].sigma) if "row_gain" in model else np.zeros(1)
 
     def shifts(self, wanted: Sequence[tuple[NoiseModel, int]]) -> np.ndarray:
         """Statistics of draws of changed models, by model and number, less those of the model [draw, statistic].
