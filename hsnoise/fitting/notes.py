@@ -61,7 +61,7 @@ def _note(number: Number, row: tuple[float, float, str], result: FitResult) -> s
             known = f"{name} is known only to {relative:.0%}, and so are read noise and dark current"
             return f"{known}: add flats, or longer darks."
         case "read_noise", "sigma" if relative > UNDETERMINED:
-            in_dn = value * float(np.mean(result.params["gain"].value))
+            in_dn = value * float(np.mean(np.asarray(result.params["gain"].value)))
             return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
         case "dark_current", "rate":
             return _dark_current_note(value, error, result)
@@ -200,7 +200,7 @@ def _drifts(result: FitResult) -> list[float]:
     """Relative change of the dark signal over the frames of each exposure, by a straight line; 0 if within chance."""
     summary, drifts = result.summary, []
     least = DRIFT_SIGMA * _noise_dn(result) if summary.histograms else 0.0  # smallest mean that counts as a signal
-    black = float(np.mean(black_level(result.params)))
+    black = float(np.mean(np.asarray(black_level(result.params))))
     for e, frames in enumerate(summary.n_frames if summary.histograms else ()):
         pixels = sum(h.row_pixels[e, :frames].sum(1) for h in summary.histograms)
         means = sum(h.row_sum[e, :frames].sum(1) for h in summary.histograms) / np.maximum(pixels, 1) - black

@@ -69,7 +69,7 @@ class Coordinates(Parameters):
 
     def sizes(self, vector) -> np.ndarray:
         """How far each coordinate moves when its parameter changes by about itself [number]."""
-        value, gain = np.asarray(self.values(vector)), float(np.mean(self.base["gain"].value))
+        value, gain = np.asarray(self.values(vector)), float(np.mean(np.asarray(self.base["gain"].value)))
         bounded = np.array([n.transform in BOUNDED for n in self.numbers])
         sizes = np.where(bounded, np.maximum(value / np.asarray(self.scale), 1.0), 1.0)
         sizes[self.where("black_level")] = gain * float(self.base["read_noise"].sigma)

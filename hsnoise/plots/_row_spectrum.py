@@ -68,7 +68,7 @@ def has_row_spectrum(fit) -> bool:
         return False
     if fit.transfer is None:
         return True
-    return bool(transfers_of(fit)) and bool(np.max(fit.params["row_gain"].sigma) > SHOWN_IN_DARKS)
+    return bool(transfers_of(fit)) and bool(np.max(np.asarray(fit.params["row_gain"].sigma)) > SHOWN_IN_DARKS)
 
 
 def _panel(axes: Axes, fit, c: int, histograms: RowHistograms) -> None:

@@ -77,7 +77,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         return
     pixel: PixelFit | None = result.transfer
     if pixel is None:
-        read_dn = float(np.mean(result.params["gain"].value)) * float(result.params["read_noise"].sigma)
+        read_dn = float(np.mean(np.asarray(result.params["gain"].value))) * float(result.params["read_noise"].sigma)
         yield f"The gain is not determined: these darks do not show it. Read noise is {read_dn:.4g} DN. {ADD}"
         return
     floor = float(np.mean([c.values[1] for c in pixel.channels]))
@@ -229,7 +229,7 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
     bounds = [plane.narrow_dn[1] for plane in planes if plane.narrow_dn]
     if not bounds or not np.isfinite(max(bounds)):
         return
-    bound, gain = max(bounds), float(np.mean(result.params["gain"].value))
+    bound, gain = max(bounds), float(np.mean(np.asarray(result.params["gain"].value)))
     electrons = f", {bound / gain:.3g} e-" if result.has_gain else ""
     yield (
         f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
