@@ -71,6 +71,10 @@ AGREES = "Nothing in these frames contradicts these numbers."
 LOOK_ALIKE = "hsnoise compare checks whether frames drawn from them look alike."
 
 
+def _flat_levels(number: int) -> str:
+    return f", {number} flat level{'s' if number != 1 else ''}"
+
+
 @dataclass(frozen=True)
 class FitResult:
     """A fitted camera.
@@ -228,7 +232,7 @@ class FitResult:
     def _title(self) -> str:
         exposures = len(self.summary.exposure_s)
         darks = f"{sum(self.summary.n_frames)} dark frames at {exposures} exposure{'s' if exposures != 1 else ''}"
-        flats = "" if self.summary.flats is None else f", {len(self.summary.flats.exposure_s)} flat levels"
+        flats = "" if self.summary.flats is None else _flat_levels(len(self.summary.flats.exposure_s))
         return f"{TITLES[self.method]}: {darks}{flats}"
 
     def _rounded_table(self) -> Table:
@@ -246,7 +250,8 @@ class FitResult:
         for doubt in self.doubts:
             console.print(f"! {doubt}", highlight=False)
         console.print(self._rounded_table())
-        console.print(f"{self.outcome}; {self.iterations} iterations", highlight=False)
+        steps = f"; {self.iterations} iterations" if self.iterations else ""
+        console.print(f"{self.outcome}{steps}", highlight=False)
         for note in self.notes:
             console.print(f"- {note}", highlight=False)
         return console.file.getvalue().rstrip()
