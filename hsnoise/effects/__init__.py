@@ -22,6 +22,7 @@ from hsnoise.effects.dark_current_drift import DarkCurrentDrift
 from hsnoise.effects.dark_current_nonuniformity import DarkCurrentNonuniformity
 from hsnoise.effects.dark_signal_nonuniformity import DarkSignalNonuniformity
 from hsnoise.effects.frame_offset import FrameOffset
+from hsnoise.effects.frame_tilt import FrameTilt
 from hsnoise.effects.gain import Gain
 from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
 from hsnoise.effects.hot_pixels import HotPixels
@@ -57,6 +58,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     RowFixedPattern,
     ColumnFixedPattern,
     FrameOffset,
+    FrameTilt,
     DarkSignalNonuniformity,
     PhotoResponseNonuniformity,
     HotPixels,
@@ -99,6 +101,7 @@ __all__ = [
     "DarkSignalNonuniformity",
     "EFFECTS",
     "FrameOffset",
+    "FrameTilt",
     "Gain",
     "HeavyTailedReadNoise",
     "HotPixels",

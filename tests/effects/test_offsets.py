@@ -13,6 +13,7 @@ from hsnoise.effects import (
     ColumnNoise,
     DarkSignalNonuniformity,
     FrameOffset,
+    FrameTilt,
     PeriodicBanding,
     RowFixedPattern,
     RowNoise,
@@ -98,6 +99,25 @@ def test_banding_is_a_sinusoid_of_new_phase(axis):
     assert stats.kstest(phase, "uniform").pvalue > P_VALUE
 
 
+@pytest.mark.parametrize("axis", ["row", "column"])
+def test_tilt_is_a_line_of_new_slope(axis):
+    frames, n = 2000, 10
+    drawn = darks(FrameTilt(2.0, axis), frames, (n, 4) if axis == "row" else (4, n))
+    drawn = drawn if axis == "row" else drawn.swapaxes(1, 2)
+    np.testing.assert_array_equal(drawn, np.broadcast_to(drawn[:, :, :1], drawn.shape))
+    slope = drawn[:, -1, 0] - drawn[:, 0, 0]
+    np.testing.assert_allclose(drawn[:, :, 0], slope[:, None] * np.linspace(-0.5, 0.5, n), atol=1e-6)
+    assert stats.kstest(slope / 2, "norm").pvalue > P_VALUE
+    assert abs(slope.var() / 4 - 1) < 5 * np.sqrt(2 / frames)
+    assert abs(np.mean(slope[1:] * slope[:-1])) / 4 < 5 / np.sqrt(frames)  # frames are independent
+    variance = 4 * (n + 1) / (n - 1) / 12
+    np.testing.assert_allclose(np.square(drawn).mean(), variance, rtol=5 * np.sqrt(2 / frames))
+
+
+def test_a_single_line_is_not_tilted():
+    np.testing.assert_array_equal(darks(FrameTilt(2.0), 3, (1, 4), cfa="mono"), 0)
+
+
 @pytest.mark.parametrize("length", [0.1, 0.6, 1e4])
 @pytest.mark.parametrize(("axis", "start", "above"), [("column", "first", True), ("row", "last", False)])
 def test_shading_decays_from_one_side(length, axis, start, above):
@@ -120,6 +140,8 @@ def test_impossible_settings_are_refused():
             BlackShading(1.0, 0.5, **wrong)
     with pytest.raises(ValueError, match=r"periodic_banding.axis: expected 'row' or 'column', got 'x'"):
         PeriodicBanding(1.0, 0.1, "x")
+    with pytest.raises(ValueError, match=r"frame_tilt.axis: expected 'row' or 'column', got 'x'"):
+        FrameTilt(1.0, "x")
     for taps in (1, 2.5):
         with pytest.raises(ValueError, match=r"tap_offsets.taps: expected a whole number of at least 2"):
             TapOffsets(1.0, taps)

@@ -79,6 +79,8 @@ DECLARED = [
     fx.RowFixedPattern(2.0, after_gain=True),
     fx.ColumnFixedPattern(2.0),
     fx.FrameOffset(1.0),
+    fx.FrameTilt(4.0),
+    fx.FrameTilt(4.0, "column", after_gain=True),
     fx.DarkSignalNonuniformity(2.0),
     fx.HotPixels(0.2, 500.0),
     fx.RandomTelegraphNoise(0.5, 8.0, 0.4),

@@ -7,18 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hsnoise.effects import AmplifierGlow, BlackShading, Gain, OddEvenPattern, TapOffsets
+from hsnoise.effects import AmplifierGlow, BlackShading, FrameTilt, Gain, OddEvenPattern, TapOffsets
 from hsnoise.model import NoiseModel, sample
 
 SENSOR = (48, 96)
-PLACED = [TapOffsets(3.0, taps=6), BlackShading(4.0, 0.1), BlackShading(4.0, 0.1, axis="row"), OddEvenPattern(2.0)]
+PLACED = [
+    TapOffsets(3.0, taps=6),
+    BlackShading(4.0, 0.1),
+    BlackShading(4.0, 0.1, axis="row"),
+    OddEvenPattern(2.0),
+    FrameTilt(8.0),
+    FrameTilt(8.0, "column"),
+]
 
 
 def model_of(*effects, cfa="mono"):
     return NoiseModel([Gain(2.0), *effects], cfa=cfa, shutter="rolling", exposure_s=1.0)
 
 
-@pytest.mark.parametrize("effect", PLACED, ids=["taps", "columns", "rows", "odd-even"])
+@pytest.mark.parametrize("effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns"])
 @pytest.mark.parametrize(("first", "shape"), [((0, 0), (48, 96)), ((20, 31), (8, 40)), ((47, 0), (1, 96))])
 def test_a_piece_is_cut_out_of_the_sensor(effect, first, shape):
     model, sensor = model_of(effect), jax.random.key(1)
