@@ -30,7 +30,7 @@ class FrameTilt(AbstractEffect):
 
     Attributes:
         axis: "row" for a line over the rows, "column" for one over the columns.
-        after_gain: whether it arises behind the gain: alike in DN in all colours, and free of the row gain. Its
+        after_gain: whether it arises after the gain: alike in DN in all colours, and free of the row gain. Its
             electrons are then DN over the mean gain of the pixels.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007.
