@@ -292,9 +292,9 @@ def test_the_function_is_public_beside_its_module():
     code = """
 import hsnoise
 assert callable(hsnoise.budget) and hsnoise.NoiseBudget
-from hsnoise.budget import NoiseBudget, budget
+from hsnoise.criticism.budget import NoiseBudget, budget
 assert hsnoise.budget is budget and hsnoise.NoiseBudget is NoiseBudget
-import hsnoise.budget
+import hsnoise.criticism.budget
 assert callable(hsnoise.budget)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
