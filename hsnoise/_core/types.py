@@ -74,6 +74,12 @@ def cfa_tile(cfa: str) -> np.ndarray:
     return np.array([channels.index(letter) for letter in cfa]).reshape(2, 2)
 
 
+def channel_index(cfa: str, shape: tuple[int, int]) -> np.ndarray:
+    """Channel of each pixel of frames of this shape, [row, column]."""
+    tile = cfa_tile(cfa)
+    return np.tile(tile, (shape[0] // len(tile), shape[1] // len(tile)))
+
+
 def check_shutter(shutter: str) -> None:
     """Raise ValueError unless `shutter` is "rolling" or "global"."""
     if shutter not in SHUTTERS:

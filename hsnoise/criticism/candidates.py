@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.arguments import listed
-from hsnoise._core.types import cfa_tile
+from hsnoise._core.types import channel_index
 from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -158,14 +158,13 @@ def with_own_statistics(model: NoiseModel, candidates: Iterable[Suspect]) -> Cal
     A statistic is one of each dark exposure, in a group called after the effect.
     """
     own = [one for one in candidates if one.statistics.__func__ is not AbstractEffect.statistics.__func__]
-    black = black_level_of(model)[cfa_tile(model.cfa)]
+    black = black_level_of(model)
 
     def measure(stack: FrameStack) -> Structure:
-        found, added = structure(stack, black_level_of(model)), []
+        found, added = structure(stack, black), []
+        black_map = black[channel_index(model.cfa, stack.shape)]
         for i in (i for i, kind in enumerate(stack.kind) if kind == "dark"):
-            frames = np.stack(list(stack.frames(i))).astype(np.float32)
-            rows, columns = frames.shape[1] // len(black), frames.shape[2] // len(black)
-            above = frames - np.tile(black, (rows, columns))
+            above = np.stack(list(stack.frames(i))).astype(np.float32) - black_map
             for effect in own:
                 for what, value in effect.statistics(above).items():
                     if not np.isfinite(value):

@@ -100,14 +100,9 @@ class Bench:
 
     def slopes(self) -> np.ndarray:
         """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
-        moved = _moved_models(self.model)
-        of_rows = [np.any(self._row_gain_of(one) != self._row_gain_of(self.model)) for one in moved]
-        steps = 1 / np.where(of_rows, FAR_REACH, REACH)
+        moved, reach = zip(*_moved_models(self.model), strict=True)
+        steps = 1 / np.array(reach)
         return self.simulator.slopes(self.model, moved, steps, SLOPE_DRAWS).mean(0) / self.base.deviation
-
-    @staticmethod
-    def _row_gain_of(model: NoiseModel) -> np.ndarray:
-        return np.asarray(model["row_gain"].sigma) if "row_gain" in model else np.zeros(1)
 
     def shifts(self, wanted: Sequence[tuple[NoiseModel, int]]) -> np.ndarray:
         """Statistics of draws of changed models, by model and number, less those of the model [draw, statistic].
@@ -118,8 +113,8 @@ class Bench:
         return (self.simulator.drawn(wanted) - self.base.draws[numbers]) / self.base.deviation
 
 
-def _moved_models(model: NoiseModel) -> list[NoiseModel]:
-    """The model with one base parameter a little off, for each of them."""
+def _moved_models(model: NoiseModel) -> list[tuple[NoiseModel, float]]:
+    """The model with one base parameter a little off, for each of them, and how many such steps it may be off."""
     models = []
     for name, what in BASE.items():
         if name not in model:
@@ -131,10 +126,11 @@ def _moved_models(model: NoiseModel) -> list[NoiseModel]:
         for i in np.ndindex(value.shape):
             changed = value.copy()
             changed[i] += steps[i]
-            models.append(model.with_value(name, what, changed))
+            models.append((model.with_value(name, what, changed), FAR_REACH if name == "row_gain" else REACH))
     if "row_gain" in model and model.shutter == "rolling":
-        models.append(model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05))
+        moved = model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05)
+        models.append((moved, REACH))
         share = float(model["row_gain"].white_share)
         if 0 < share < 1:
-            models.append(model.with_value("row_gain", "white_share", min(share + 0.05, 1.0)))
+            models.append((model.with_value("row_gain", "white_share", min(share + 0.05, 1.0)), REACH))
     return models

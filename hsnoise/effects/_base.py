@@ -37,6 +37,7 @@ from hsnoise._core.types import (
     Scalar,
     Window,
     cfa_tile,
+    channel_index,
     channels_of,
     is_traced,
 )
@@ -153,8 +154,7 @@ class Capture(eqx.Module):
     @property
     def channel_index(self) -> np.ndarray:
         """Channel of each pixel, [row, column]."""
-        tile = cfa_tile(self.cfa)
-        return np.tile(tile, (self.shape[0] // len(tile), self.shape[1] // len(tile)))
+        return channel_index(self.cfa, self.shape)
 
     def per_pixel(self, values: PerChannel) -> PixelMap:
         """Spread values [channel] over the pixels of their colour, [1, row, column]."""

@@ -28,16 +28,10 @@ from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 8, 2, 32
-SCATTER_DRAWS, SCATTER_FROM = (
-    32,
-    1000,
-)  # draws for the weights, whose numbers begin where those of the means do not reach
+SCATTER_DRAWS, SCATTER_FROM = 32, 1000  # draws for the weights; their numbers are none of those of the means
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
 SLOPE_NOISE = 8.0  # a slope of less than the root of it, in its standard errors, counts as zero
-SLACK, MUCH_LESS = (
-    0.02,
-    0.5,
-)  # of the cost: rare counts make it rough; a step after which the derivatives are good enough
+SLACK, MUCH_LESS = 0.02, 0.5  # of the cost: rare counts make it rough; a step that shows good derivatives
 LEAST_DAMPING = 0.1  # of the information, once a step failed
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
 SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
@@ -106,16 +100,11 @@ class _Yardstick:
         mean = self.simulator.draws(self.problem.at(y), count).mean(0)
         return _Point(y, (self.simulator.measured.values - mean) / self.deviation)
 
-    def weight(self, point: _Point) -> np.ndarray:
-        """Weights [statistic, statistic], those of statistics that are far off made smaller."""
-        share = share_of_far(point.off)
-        return share[:, None] * self.equal * share
-
     def errors(self, slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
         """Standard errors of estimates [number]: the scatter of half of the draws, with weights from the other half."""
         found, prior = [], self.problem.prior
         for equal, others in zip(self.halves, (self.scatter[1::2], self.scatter[::2]), strict=True):
-            gain = slopes.T @ (share[:, None] * equal * share)
+            gain = slopes.T @ _weighted(equal, share)
             covariance = np.linalg.inv(gain @ slopes + np.diag(prior))
             found.append(np.diagonal(as_scattered(covariance, gain, prior, others - others.mean(0))))
         return np.sqrt(np.mean(found, 0))
@@ -124,7 +113,12 @@ class _Yardstick:
         """Derivatives of the statistics at y [statistic, number], over `steps`."""
         moved = [self.problem.at(y + steps * (np.arange(len(y)) == i)) for i in range(len(y))]
         slopes = self.simulator.slopes(self.problem.at(y), moved, steps, SLOPE_DRAWS)
-        return (_without_noise(slopes / self.deviation)).T
+        return _without_noise(slopes / self.deviation).T
+
+
+def _weighted(equal: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Weights [statistic, statistic], those of statistics that are far off made smaller by their `share`."""
+    return share[:, None] * equal * share
 
 
 def _without_noise(slopes: np.ndarray) -> np.ndarray:
@@ -151,13 +145,14 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
     by = np.where(np.arange(len(here.y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
     while iterations < MOST_ITERATIONS:
         iterations += 1
-        weight = yard.weight(here)
+        share = share_of_far(here.off)
+        weight = _weighted(yard.equal, share)
         if wanted:
             slopes, taken, fresh = yard.slopes(here.y, by), taken + 1, True
         gain = slopes.T @ weight
         information = gain @ slopes + np.diag(problem.prior)
         covariance = np.linalg.inv(information)
-        deviation = yard.errors(slopes, share_of_far(here.off))
+        deviation = yard.errors(slopes, share)
         by = np.minimum(by, STEP_SIGMA * deviation)
         uphill = here.uphill(gain, problem)
         length = float(np.abs(covariance @ uphill / deviation).max())

@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise._core.keys import key_of, named_key
 from hsnoise._core.naming import named, setting
-from hsnoise._core.types import RandomKey, cfa_tile
+from hsnoise._core.types import RandomKey, cfa_tile, channel_index
 from hsnoise.effects import Stage
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.summary import Summary
@@ -88,7 +88,7 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
     """Expected photoelectrons [row, column] at which `model` gives an exposure of `like` its mean; 0 in darks."""
     if like.kind[exposure] == "dark":
         return np.broadcast_to(np.float32(0), like.shape)
-    channel = np.tile(cfa_tile(like.cfa), [n // len(cfa_tile(like.cfa)) for n in like.shape])
+    channel = channel_index(like.cfa, like.shape)
     dark_e = float(model["dark_current"].rate) * like.exposure_s[exposure] if "dark_current" in model else 0.0
     above_black = _illumination_dn(like, exposure) - black_level_of(model)[channel]
     return np.maximum(above_black / np.asarray(model["gain"].value)[channel] - dark_e, 0.0).astype(np.float32)
