@@ -294,7 +294,7 @@ def test_a_capture_larger_than_memory_is_fitted_on_a_part_of_it_and_told(monkeyp
     monkeypatch.setattr(statistics, "MOST_MIB", sum(h.counts.nbytes for h in whole.summary.histograms) / 2**20 / 2)
     part = hsnoise.fit(capture(model))
     assert_recovered(part, model)
-    assert "rests on" in part.notes[0]
+    assert "this fit uses 8 of 16 dark frames" in part.notes[0]
     # Of half the frames, or somewhat more where their histograms have fewer bins.
     for name in ("read_noise.sigma", "dark_current.rate"):
         assert 1.05 < part.table[name][1] / whole.table[name][1] < 1.5
