@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.fitting.gradients import gradient_at
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
 from hsnoise.likelihood.parameters import Parameters, parameters_of
-from hsnoise.likelihood.plan import plan_rules, replan
-from hsnoise.likelihood.summary import coding_of, summarise, without_counts
+from hsnoise.likelihood.score import Score
+from hsnoise.likelihood.summary import coding_of, summarise
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
 from hsnoise.simulation.portion import Portion
@@ -24,7 +23,6 @@ from hsnoise.statistics.structure import Structure, structure
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
 MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
-MARGIN = 1.15
 UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
 SCORE_ERROR = 0.3  # at least, of the score in whitened units, whose deviation is 1 where the base fit is right
 
@@ -107,8 +105,9 @@ class Problem:
         return coding_of(self.portion.frames)
 
     @cached_property
-    def rules(self):
-        return plan_rules(self.coordinates.base, summarise(self.portion.frames, coding=self.coding), MARGIN)
+    def score(self) -> Score:
+        """Of the base likelihood at the base fit."""
+        return Score.of(self.coordinates, self.centre, summarise(self.portion.frames, coding=self.coding))
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -138,11 +137,7 @@ class Problem:
     def statistics(self, frames: FrameStack) -> Structure:
         """Score of the base likelihood in whitened units, and the structure of the frames."""
         found = structure(frames, black_level_of(self.base.params))
-        summary = summarise(frames, coding=self.coding)
-        with jax.enable_x64(True):
-            rules = replan(self.rules, plan_rules(self.coordinates.base, summary, MARGIN))
-            _, gradient = gradient_at(self.coordinates, jnp.asarray(self.centre), without_counts(summary), rules)
-            score = self.whiten.T @ np.asarray(gradient)
+        score = self.whiten.T @ self.score(summarise(frames, coding=self.coding))
         return replace(
             found,
             names=(*(f"score: direction {i}" for i in range(len(score))), *found.names),

@@ -118,28 +118,62 @@ def dark_laws(model: NoiseModel, exposure_s):
     return jax.vmap(poisson_normal_law, (0, None))(mean_e, model["read_noise"].sigma)
 
 
+class Tables(NamedTuple):
+    """What the likelihood knows of the rows of a part at some parameters.
+
+    log_p: log P(bin | beta) [group, node, bin] of each block. prior: of the row gain: its variance where rows are
+    white, its spectrum [row] where they are coloured, None without row gain.
+    """
+
+    log_p: tuple[jax.Array, ...]
+    prior: jax.Array | None
+
+
 def rows_log_likelihood(model: NoiseModel, outliers, rule: RowRule, laws, summary: Summary) -> jax.Array:
     """Log-likelihood of the rows of a rule's channels in all exposures."""
 
     def part(moved, inputs):
         (model, outliers), (at, blocks, layout, scale) = moved, inputs
-        if "row_gain" not in model:
-            return (blocks[0].counts[0, 0] * log_probability(model, outliers, at, jnp.ones(1))[0]).sum()
-        row_gain, sigma = model["row_gain"], row_sigma(model)[at.channel]
-        curves = []
-        for block in blocks:
-            nodes = rows.make_nodes(block.low, block.high, scale, sigma, block.nodes, block.open_below)
-            table = log_probability(model, outliers, at, nodes.beta.ravel()).reshape(*nodes.beta.shape, -1)
-            curves.append((_curves(block.counts, table), nodes))
-        of_rows = rows.Curves(tuple(curves), layout)
-        if summary.shutter == "global":
-            return rows.log_evidence_white(of_rows, sigma**2)
-        spectrum = rows.row_spectrum(row_gain.exponent, summary.shape[0], rule.row_stride, row_gain.white_share)
-        return rows.log_evidence_coloured(of_rows, sigma**2 * spectrum).sum()
+        nodes = nodes_of(model, at.channel, blocks, scale)
+        tables = tables_of(model, outliers, at, nodes, summary, rule.row_stride)
+        return evidence(tables, nodes, [block.counts for block in blocks], layout)
 
     at = binning(summary, laws, rule.channel, rule.exposure, rule.edges_dn, rule.outlier_law)
     inputs = jax.tree.map(jnp.asarray, (at, rule.blocks, rule.layout, rule.scale))
     return _sum_with_gradient(part, (model, outliers), inputs)
+
+
+def nodes_of(model: NoiseModel, channel, blocks: tuple[Block, ...], scale) -> tuple[rows.Nodes, ...]:
+    """The nodes of each block of a part; a single one without row gain."""
+    if "row_gain" not in model:
+        return (rows.Nodes(jnp.ones((1, 1)), jnp.zeros((1, 1)), open_below=False),)
+    sigma = row_sigma(model)[channel]
+    return tuple(rows.make_nodes(b.low, b.high, scale, sigma, b.nodes, b.open_below) for b in blocks)
+
+
+def tables_of(
+    model: NoiseModel, outliers, at: Binning, nodes: tuple[rows.Nodes, ...], summary: Summary, row_stride: int
+) -> Tables:
+    """The tables of a part at a model and shares of outliers."""
+    log_p = tuple(log_probability(model, outliers, at, of.beta.ravel()).reshape(*of.beta.shape, -1) for of in nodes)
+    if "row_gain" not in model:
+        return Tables(log_p, None)
+    row_gain, variance = model["row_gain"], row_sigma(model)[at.channel] ** 2
+    if summary.shutter == "global":
+        return Tables(log_p, variance)
+    spectrum = rows.row_spectrum(row_gain.exponent, summary.shape[0], row_stride, row_gain.white_share)
+    return Tables(log_p, variance * spectrum)
+
+
+def evidence(tables: Tables, nodes: tuple[rows.Nodes, ...], counts, layout: rows.Layout | None) -> jax.Array:
+    """Log-likelihood of the rows of a part; counts [group, row, bin] of each block."""
+    curves = [_curves(of_rows, log_p) for of_rows, log_p in zip(counts, tables.log_p, strict=True)]
+    if tables.prior is None:
+        return sum(of.sum() for of in curves)
+    of_rows = rows.Curves(tuple(zip(curves, nodes, strict=True)), layout)
+    if tables.prior.ndim == 0:
+        return rows.log_evidence_white(of_rows, tables.prior)
+    return rows.log_evidence_coloured(of_rows, tables.prior).sum()
 
 
 @jax.custom_vjp

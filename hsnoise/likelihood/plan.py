@@ -99,6 +99,31 @@ def replan(old: Rules, new: Rules) -> Rules:
     return tuple(enough(o, n) for o, n in zip(old, new, strict=True))
 
 
+def with_rows_of(rule: RowRule, summary: Summary) -> RowRule:
+    """The same bins and nodes with the rows of another capture, which is summarised in the same bins."""
+    channels, exposures = list(dict.fromkeys(rule.channel)), len(summary.exposure_s)
+    edges = rule.edges_dn.reshape(len(channels), exposures, -1)
+    histograms = [_in_bins(summary.histograms[c], e) for c, e in zip(channels, edges, strict=True)]
+    if rule.layout is None:
+        pooled = np.concatenate([h.counts.sum((1, 2), dtype=np.float64) for h in histograms])
+        return replace(rule, blocks=(replace(rule.blocks[0], counts=pooled[:, None, None, :]),))
+    layouts, counts = zip(*map(sort_rows, histograms), strict=True)
+    whole, ends = np.concatenate(counts), np.cumsum([0, *(b.low.shape[1] for b in rule.blocks)])
+    cuts = zip(rule.blocks, ends, ends[1:], strict=False)
+    blocks = tuple(replace(block, counts=whole[:, start:stop]) for block, start, stop in cuts)
+    return replace(rule, blocks=blocks, layout=jax.tree.map(lambda *x: np.concatenate(x), *layouts))
+
+
+def _in_bins(h: RowHistograms, edges: np.ndarray) -> RowHistograms:
+    """Histograms with the edges [exposure, bin - 1], some of their own; those that repeat leave bins empty."""
+    counts = np.zeros((*h.counts.shape[:-1], edges.shape[-1] + 1), h.counts.dtype)
+    for e, (own, wanted) in enumerate(zip(h.edges_dn, edges, strict=True)):
+        starts = np.r_[0, np.searchsorted(own, np.unique(wanted)) + 1]
+        merged = np.add.reduceat(h.counts[e], starts, axis=-1, dtype=h.counts.dtype)
+        counts[e, ..., : len(starts) - 1], counts[e, ..., -1] = merged[..., :-1], merged[..., -1]
+    return replace(h, counts=counts, edges_dn=edges)
+
+
 def _with_bins(rule: RowRule, bins: int) -> RowRule:
     """The rule with at least as many bins: further ones, empty and of no width, before the last."""
     further = bins - rule.outlier_law.shape[-1]
@@ -152,7 +177,7 @@ def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary
     scale = np.clip(1 / (float(model["gain"].value[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
     bins = histograms.edges_dn, histograms.outlier_law
     beta, table, information = (np.asarray(x) for x in _scan(at, c, without_counts(summary), *bins, scale))
-    layout, counts = _sort_rows(histograms)
+    layout, counts = sort_rows(histograms)
     low, high, peak = _reach(table, beta, counts)
     # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
@@ -177,7 +202,7 @@ def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary
     return layout, scale, tuple(blocks)
 
 
-def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
+def sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
     """Rows of each exposure in groups of similar mean, and their histograms in that order."""
     exposures, frames, n, bins = histograms.counts.shape
     total = frames * n
