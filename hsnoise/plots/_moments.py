@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hsnoise._core.quadrature import normal_nodes
 from hsnoise.likelihood.darks import black_level_at, dark_current
 from hsnoise.lut import clipped_moments
 from hsnoise.model import NoiseModel
@@ -14,8 +15,8 @@ LEAST_BETA = 1e-6
 
 def beta_rule(sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights [beta] of the row gain Normal(1, sigma^2)."""
-    z, weight = np.polynomial.hermite_e.hermegauss(BETA_NODES)
-    return 1 + sigma * z, weight / weight.sum()
+    z, weight = normal_nodes(BETA_NODES)
+    return 1 + sigma * z, weight
 
 
 def count_moments(model: NoiseModel, c: int, exposure_s, beta, white_level_dn: float | None):

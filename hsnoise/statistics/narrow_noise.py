@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import scipy  # its submodules are imported on first use
 
+from hsnoise._core.quadrature import normal_nodes
+
 SIGMAS_DN = np.geomspace(0.02, 1.0, 120)
 STEPS_PER_DN = 50  # of the grid of levels
 NEAR = 2e-3  # tolerated misfit of shares and variance: noise is not quite normal
@@ -72,8 +74,7 @@ def _estimate(codes: np.ndarray, share: np.ndarray, variance: float) -> float:
     """Sigma of normal noise on normally distributed levels with this mean, variance and variance over time."""
     mean = codes @ share
     spread = codes**2 @ share - mean**2
-    z, weight = np.polynomial.hermite_e.hermegauss(61)
-    weight = weight / weight.sum()
+    z, weight = normal_nodes(61)
 
     def off(x):
         levels, sigma = x[0] + np.exp(x[1]) * z, np.exp(x[2])

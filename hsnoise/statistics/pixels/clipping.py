@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
+from hsnoise._core.quadrature import normal_nodes
+
 NODES = 15  # over the offsets of a class
 STEPS = 60
 TOLERANCE = 1e-10
@@ -40,13 +42,12 @@ def unclipped(mean: float, variance: float, scatter: float) -> tuple[float, floa
 
 def clipped_moments(level: float, sigma: float, scatter: float) -> tuple[float, float]:
     """Mean and average variance of max(normal(level + offset, sigma^2), 0) over pixels with normal offsets."""
-    z, weight = np.polynomial.hermite_e.hermegauss(NODES)
+    z, weight = normal_nodes(NODES)
     off = level + scatter * z - EDGE_DN
     t = off / sigma
     density = np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi)
     first = off * ndtr(t) + sigma * density
     second = (off**2 + sigma**2) * ndtr(t) + off * sigma * density
-    weight = weight / weight.sum()
     # Clipped values have count 0, half a count above the edge.
     first_dn = first + EDGE_DN + 0.5 * ndtr(-t)
     variance = second + 0.25 * ndtr(-t) - (first + 0.5 * ndtr(-t)) ** 2

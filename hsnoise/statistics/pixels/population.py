@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import erfcx, ndtr
 
+from hsnoise._core.quadrature import normal_nodes
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
 
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
@@ -116,8 +117,7 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
 
 def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
     """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise."""
-    z, weight = np.polynomial.hermite_e.hermegauss(NODES)
-    weight = weight / weight.sum()
+    z, weight = normal_nodes(NODES)
     body = mean * np.exp(spread * z - spread**2 / 2)
     off = (x[:, None] - body) / noise
     if noise > WIDE * spread * mean:
