@@ -20,6 +20,7 @@ import scipy  # its parts are imported when they are used
 from hsnoise.frames.bayer import channel_rows
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.flat_pairs import Shot, pairs_of_singles
+from hsnoise.statistics.pixels.clipping import unclipped
 
 FLICKER = 0.5  # of the mean: more is another light
 OUTLIERS = 1e-7  # chance that a pixel is taken for one hit by a cosmic ray
@@ -29,6 +30,7 @@ PILED_UP = 1e-3  # of the pixels on the highest count: it is where they saturate
 FEWEST_PILED = 10  # likewise
 FEWEST_PIXELS = 0.5  # of a level, after those that saturate
 CLEAR_DARKS = 0.98  # of darks, else they clip
+FEW_CLIPPED = 0.02  # of the counts of darks: as if their noise were normal
 SAME_EXPOSURE = 0.01
 SAMPLE_PIXELS = 100_000  # for what is typical
 OUTER = 1e-3  # of the pixels on each side
@@ -310,23 +312,43 @@ def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | 
     typical = float(variance[kept].mean(dtype=np.float64))
     clear = kept & _unclipped(sums, zero_dn + light * relative, typical, white_level, is_dark)
     centred = (1 - 1 / rows) * (1 - 1 / pixels)
+    if is_dark and sums.lowest <= 0 and (whole := _without_clipping(zero_dn + relative[kept], typical / centred, n)):
+        level, corrected, growth = whole
+        return level, corrected, kept.sum() * centred * (n - 1) / growth**2, *_of_rows(sums, zero_dn, light), 1.0
     # Frames of unequal light weigh the read noise by more than one.
     more = n * (1 / sums.light**2).sum() / (1 / sums.light).sum() ** 2 - 1
-    series = (sums.row_means - zero_dn) * (light / sums.light[:, None])
-    moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
-    moving -= moving.mean(0, keepdims=True)
-    row_dof = (rows - 1) * (n - 1)
     if not clear.any():
         return zero_dn, *np.full(5, np.nan), 1e-9
     return (
         zero_dn + light * float(relative[clear].mean(dtype=np.float64)),
         float(variance[clear].mean(dtype=np.float64)) / centred - more * read_dn2,
         clear.sum() * centred * (n - 1),
-        float((moving**2).sum() / row_dof),
-        row_dof,
-        pixels,
+        *_of_rows(sums, zero_dn, light),
         clear.sum() / max(kept.sum(), 1),
     )
+
+
+def _of_rows(sums: _Sums, zero_dn: float, light: float) -> tuple[float, float, float]:
+    """Mean square of what changes in the means of rows, DN^2, its degrees of freedom, and pixels in a row."""
+    series = (sums.row_means - zero_dn) * (light / sums.light[:, None])
+    moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
+    moving -= moving.mean(0, keepdims=True)
+    frames, rows = series.shape
+    dof = (rows - 1) * (frames - 1)
+    return float((moving**2).sum() / dof), dof, sums.relative.shape[1]
+
+
+def _without_clipping(level: np.ndarray, variance: float, frames: int) -> tuple[float, float, float] | None:
+    """Mean and variance over time, DN, DN^2, that darks have without their few counts at 0, and the growth of an error.
+
+    level: mean of each pixel over the frames. None where more than a few counts clip: their noise need not be normal.
+    """
+    low, middle, high = np.quantile(level, (0.1587, 0.5, 0.8413))
+    scatter = np.sqrt(max(((high - low) / 2) ** 2 - variance / frames, 0.0))
+    if scipy.special.ndtr((0.5 - middle) / np.hypot(np.sqrt(variance), scatter)) > FEW_CLIPPED:
+        return None
+    found = unclipped(float(level.mean(dtype=np.float64)), variance, float(scatter))
+    return found if np.isfinite(found[1]) else None
 
 
 def _ordinary(variance: np.ndarray, relative: np.ndarray, frames: int) -> np.ndarray:

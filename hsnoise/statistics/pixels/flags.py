@@ -9,7 +9,8 @@ from hsnoise.statistics.pixels.classes import hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.survey import Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
-DIM = 0.5  # of the median response to light: below it a pixel is dead
+DIM, NEIGHBOURS = 0.5, 32  # of the median response of so many pixels of a row: below it a pixel is dead
+LIT_SIGMAS = 5.0  # of the noise of a level, of a signal below which no light falls
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
 
 
@@ -40,16 +41,34 @@ def counts_of(flags: np.ndarray) -> dict[str, float]:
 
 
 def _dead(found: Survey, channel: int) -> np.ndarray:
-    """Pixels that hardly respond to light."""
+    """Pixels that hardly respond to light, or are where none falls, as overscan is.
+
+    They are compared with their neighbours in the row: light may fall off by any factor over a frame.
+    """
     flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.of(channel)]) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
-    darks = found.repeated_darks
-    black = np.zeros_like(level[bright])
+    darks, frames = found.repeated_darks, flats[bright].n_frames
+    black, noise = np.zeros_like(level[bright]), 0.0
     if darks:
         black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].of(channel)])
+        noise = darks[0].noise_dn * np.sqrt(1 / frames + 1 / darks[0].n_frames)
     signal = level[bright] - black
-    return signal < DIM * np.median(signal)
+    least = LIT_SIGMAS * noise
+    if np.median(signal) < least:
+        return np.zeros(len(signal), bool)
+    plane = found.groups[0].of(channel)[0]
+    nearby = _of_neighbours(signal, len(plane.column_mean_dn))
+    return (signal < DIM * nearby) | (nearby < least)
+
+
+def _of_neighbours(values: np.ndarray, columns: int) -> np.ndarray:
+    """Median of the run of NEIGHBOURS pixels of its row in which each pixel lies; the last run may be longer."""
+    rows, out = values.reshape(-1, columns), np.empty(values.shape, values.dtype).reshape(-1, columns)
+    starts = np.arange(0, max(columns - NEIGHBOURS + 1, 1), NEIGHBOURS)
+    for start, stop in zip(starts, [*starts[1:], columns], strict=True):
+        out[:, start:stop] = np.median(rows[:, start:stop], axis=1, keepdims=True)
+    return out.ravel()
 
 
 def _jumping(halves, pixels: int) -> np.ndarray:
