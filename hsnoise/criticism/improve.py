@@ -117,7 +117,10 @@ def improved(
     unseen = None if held_out is None else Portion.of(held_out)
     work, split = _Work(fitted, portion, unseen, seed, tell, limit), split_in_words(fitted, held_out)
     work.say(Event("Fitting the first model"))
-    steps = replace(work, limit=NO_LIMIT).begun(fit(fitted, model=model))
+    first = fit(fitted, model=model)
+    if not first.has_gain:
+        work = replace(work, portion=portion.without_flats("the gain is not determined, and flats need it"))
+    steps = replace(work, limit=NO_LIMIT).begun(first)
     measured = len(steps)
     while (ending := limit.reached(len(steps) - measured)) is None:
         keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split))

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import jax
 import numpy as np
+import scipy  # its parts are imported when they are used
 
 from hsnoise._core.keys import key_of, named_key
 from hsnoise._core.naming import named, setting
@@ -16,7 +17,7 @@ from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
-SURFACE_DEGREE = 3  # of the light on flats
+SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
 
 
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
@@ -96,12 +97,12 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
-    """Mean of an exposure [row, column], DN, of each plane of the Bayer pattern the smooth part: a cubic surface."""
+    """Mean of an exposure [row, column], DN, of each plane of the Bayer pattern without what pixels differ by.
+
+    The light of real flats has edges (a slit, dust, a vignette) that no low polynomial follows.
+    """
     mean = np.mean([frame.astype(np.float32) for frame in like.frames(exposure)], axis=0, dtype=np.float64)
-    step, surface = len(cfa_tile(like.cfa)), np.empty(like.shape)
+    step, smooth = len(cfa_tile(like.cfa)), np.empty(like.shape)
     for r, c in np.ndindex(step, step):
-        plane = mean[r::step, c::step]
-        down, across = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n), SURFACE_DEGREE) for n in plane.shape)
-        coefficients = np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T
-        surface[r::step, c::step] = down @ coefficients @ across.T
-    return surface
+        smooth[r::step, c::step] = scipy.ndimage.gaussian_filter(mean[r::step, c::step], SMOOTH_PIXELS, mode="nearest")
+    return smooth

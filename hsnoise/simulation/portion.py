@@ -41,7 +41,9 @@ class Portion:
         check_size(stack)
         if "dark" not in stack.kind:
             raise ValueError("stack: expected dark frames, got flats only")
-        chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds]
+        # In a single flat, nothing tells noise from what is in the light.
+        single = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] == 1]
+        chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds and i not in single]
         rows, columns = stack.shape
         per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(chosen) * rows * columns))
         frames = sum(min(stack.n_frames[i], per_exposure) for i in chosen)
@@ -56,6 +58,10 @@ class Portion:
         # What depends on the place stays where it is on the sensor.
         window = part.window or ((0, first, rows, columns) if end - first < columns else None)
         left_out = []
+        if single and "flat" in kinds:
+            left_out.append(
+                f"{len(single)} flats of a single frame were not compared: noise or light, nothing tells"
+            )
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):
@@ -69,6 +75,11 @@ class Portion:
         if len(dark) == self.frames.n_exposures:
             return self
         return Portion(self.frames.select(exposures=dark), self.left_out)
+
+    def without_flats(self, why: str) -> Portion:
+        """Its dark exposures, where flats cannot be compared."""
+        darks = self.darks
+        return darks if darks is self else Portion(darks.frames, (*self.left_out, f"flats were not compared: {why}"))
 
 
 def middle_of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> FrameStack:
