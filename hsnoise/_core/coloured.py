@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy  # its parts are imported when they are used
 
 from hsnoise._core.types import RandomKey, Scalar
+
+EXPONENTS = (-2.0, 3.0)  # of a series by its correlation
 
 
 def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
@@ -26,6 +30,25 @@ def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
 def fading_power(n: int, exponent: Scalar) -> jax.Array:
     """Power law [n] whose DC term is 1 for white noise and falls to 0 at an exponent of 1 or -1."""
     return power_law(n, exponent, jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2)
+
+
+def exponent_of(correlation: float, n: int, lag: int = 1) -> float:
+    """Exponent at which series of `fading_power` [n], less their means, have this correlation `lag` apart.
+
+    Between EXPONENTS: a series of whatever correlation is no redder or bluer. Two apart and more, blue series are
+    alike and count as white.
+    """
+
+    def off(exponent: float) -> float:
+        with jax.enable_x64(True):
+            power = np.array(fading_power(n, jnp.float64(exponent)))
+        power[0] = 0.0
+        return float(power @ np.cos(2 * np.pi * lag * np.arange(n) / n)) / float(power.sum()) - correlation
+
+    low, high = EXPONENTS if lag == 1 else (0.0, EXPONENTS[1])
+    if off(low) >= 0 or off(high) <= 0:
+        return low if off(low) >= 0 else high
+    return float(scipy.optimize.brentq(off, low, high, xtol=1e-4))
 
 
 def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None = None) -> jax.Array:

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hsnoise._core.coloured import exponent_of
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
-from hsnoise.statistics.pixels.population import Population, offset_sigma, population_of
+from hsnoise.statistics.pixels.population import Population, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
@@ -35,6 +36,8 @@ PATTERNS = {
 DETERMINED = 0.25  # relative standard error up to which a gain is a number
 MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that jump as if a signal grew
 ROW_GAIN_THERE = 3.0
+TOGETHER = 6.0  # deviations by chance from which rows are not white
+LEAST_EXPONENT_ERROR = 0.01  # no spectrum is a power law
 ROUNDS = 30
 UNKNOWN = 1e6  # relative error of what is not known
 
@@ -53,6 +56,8 @@ class Channel:
             error, and its deviation by chance where there is none.
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
+        row_exponent: of the spectrum of what rows share, with its error; 0 and infinite where they are white.
+        warm: share of warm pixels and their mean extra level, DN, with errors, in darks of one exposure; else None.
     """
 
     name: str
@@ -66,6 +71,8 @@ class Channel:
     patterns: Mapping[str, tuple[float, float, float]]
     temporal_dn2: float
     shading: Mapping[str, Shading]
+    row_exponent: tuple[float, float]
+    warm: tuple[tuple[float, float], tuple[float, float]] | None
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,42 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     rows, shading = _row_gain(found, c, values[2]), _shadings(found, c)
     patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
-    return Channel(name, transfer, population, offset, values, covariance, black, rows, patterns, floor, shading)
+    warm = _warm(found, c) if narrow is None and not found.has_exposures else None
+    if warm is not None:  # many warm pixels move the median of all: what is not theirs is black
+        (share, _), (extra, _) = warm
+        black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
+    of_rows = patterns, floor, shading, _row_exponent(found, c)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, warm)
+
+
+def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
+    """Exponent of what rows share in a frame, from the covariance of neighbouring rows of a plane, and its error."""
+    planes = _shortest(found, c)
+    if not planes:
+        return 0.0, np.inf
+    together, alone = (mean_of([of(p) for p in planes]) for of in (_together, _alone))
+    if alone.variance_dn2 <= 0 or abs(together.variance_dn2) < TOGETHER * together.chance_dn2:
+        return 0.0, np.inf
+    step = found.shape[0] // len(planes[0].row_mean_dn)
+    correlation = together.variance_dn2 / alone.variance_dn2
+    error = np.hypot(together.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
+    low, middle, high = (exponent_of(correlation + way * error, found.shape[0], step) for way in (-1, 0, 1))
+    return middle, max((high - low) / 2, LEAST_EXPONENT_ERROR)
+
+
+def _together(plane: Plane) -> Component:
+    return plane.rows_together
+
+
+def _alone(plane: Plane) -> Component:
+    return plane.components["row_x_frame"]
+
+
+def _warm(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    planes = _shortest(found, c)
+    if not planes:
+        return None
+    return warm_of(np.concatenate([p.halves.level_dn for p in planes], 1), len(planes[0].column_mean_dn))
 
 
 def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:

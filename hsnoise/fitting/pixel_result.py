@@ -55,7 +55,7 @@ BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_l
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
     """The result; `model` says which effects are wanted (None: the paper's, and those of the population found)."""
     gain, read, rate = _electrons(pixel)
-    population = _population(pixel, gain)
+    population = _population(pixel, gain, float(np.max(summary.exposure_s, initial=0.0)))
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
     black, row = _black(pixel, summary), _rows(pixel)
@@ -119,7 +119,7 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
     return np.ones(n), float(np.sqrt(floor)), float(np.mean([c.values[2] for c in pixel.channels]))
 
 
-def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
     """Effects of the population that are there: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     drift = _shading(pixel)
@@ -136,12 +136,14 @@ def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
+            if name == "row_noise" and np.isfinite((exponent := _mean([c.row_exponent for c in pixel.channels]))[1]):
+                found[name]["exponent"] = exponent
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
-        return found
+        return found | _warm(pixel, gain, longest_s)
     spread = _mean(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
@@ -158,6 +160,18 @@ def _population(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[
     if hot["fraction"][0] > THERE * hot["fraction"][1] and hot["rate"][0] > 0:
         found["hot_pixels"] = hot
     return found
+
+
+def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
+    """Hot pixels as darks of one exposure show them: charge of the exposure, or of the readout if that is zero."""
+    many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
+    if not many:
+        return {}
+    fraction = _mean([warm[0] for warm, _ in many])
+    charge = _mean([(warm[1][0] / g, warm[1][1] / g) for warm, g in many])
+    if longest_s > 0:
+        return {"hot_pixels": {"fraction": fraction, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
+    return {"hot_pixels": {"fraction": fraction, "rate": (0.0, np.inf), "at_readout": charge}}
 
 
 def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
@@ -222,7 +236,8 @@ def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: Pix
     classes: dict[str, Any] = {cls.name: cls for cls in OF_PIXELS}
     for name in wanted:
         if name in classes:
-            fields = {field: max(value, 0.0) for field, (value, _) in population.get(name, {}).items()}
+            specs, measured = classes[name].specs(), population.get(name, {})
+            fields = {of: value if specs[of].low is None else max(value, 0.0) for of, (value, _) in measured.items()}
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
             fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}
             drift = _shading(pixel) if name == "black_shading" else None

@@ -59,9 +59,7 @@ class Portion:
         window = part.window or ((0, first, rows, columns) if end - first < columns else None)
         left_out = []
         if single and "flat" in kinds:
-            left_out.append(
-                f"{len(single)} flats of a single frame were not compared: noise or light, nothing tells"
-            )
+            left_out.append(f"{len(single)} flats of a single frame were not compared: noise or light, nothing tells")
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):

@@ -6,10 +6,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from hsnoise.statistics.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.statistics.pixels.sample import of_neighbours
 from hsnoise.statistics.pixels.survey import Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
-DIM, NEIGHBOURS = 0.5, 32  # of the median response of so many pixels of a row: below it a pixel is dead
+DIM = 0.5  # of the median response of its neighbours: below it a pixel is dead
 LIT_SIGMAS = 5.0  # of the noise of a level, of a signal below which no light falls
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
 
@@ -58,17 +59,8 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
     if np.median(signal) < least:
         return np.zeros(len(signal), bool)
     plane = found.groups[0].of(channel)[0]
-    nearby = _of_neighbours(signal, len(plane.column_mean_dn))
+    nearby = of_neighbours(signal, len(plane.column_mean_dn))
     return (signal < DIM * nearby) | (nearby < least)
-
-
-def _of_neighbours(values: np.ndarray, columns: int) -> np.ndarray:
-    """Median of the run of NEIGHBOURS pixels of its row in which each pixel lies; the last run may be longer."""
-    rows, out = values.reshape(-1, columns), np.empty(values.shape, values.dtype).reshape(-1, columns)
-    starts = np.arange(0, max(columns - NEIGHBOURS + 1, 1), NEIGHBOURS)
-    for start, stop in zip(starts, [*starts[1:], columns], strict=True):
-        out[:, start:stop] = np.median(rows[:, start:stop], axis=1, keepdims=True)
-    return out.ravel()
 
 
 def _jumping(halves, pixels: int) -> np.ndarray:

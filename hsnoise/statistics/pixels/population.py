@@ -16,6 +16,7 @@ from scipy.special import erfcx, ndtr
 
 from hsnoise._core.quadrature import normal_nodes
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
+from hsnoise.statistics.pixels.sample import of_neighbours
 
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
@@ -25,6 +26,7 @@ SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ
 LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
 MOST_HOT = 0.3
+WARM_SIGMAS = 6.0  # of the levels below the median
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
 
@@ -100,6 +102,23 @@ def population_of(
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
     )
+
+
+def warm_of(halves: np.ndarray, columns: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Share of warm pixels and their mean extra level in one exposure, DN, with errors; None where there are none.
+
+    halves [half, pixel]: levels of pixels of rows of so many columns. What neighbours share, shading as well, is no
+    extra. Without a second exposure nothing tells charge of the exposure from charge of the readout.
+    """
+    off = np.stack([half - of_neighbours(half, columns) for half in halves]).astype(np.float64)
+    extra = off.mean(0) - np.median(off.mean(0))
+    noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
+    if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise):
+        return None
+    values, errors = _fitted(extra, noise)
+    if values[2] <= 0:
+        return None
+    return (float(values[2]), float(errors[2])), (float(values[3]), float(errors[3]))
 
 
 def _hot_again(halves: np.ndarray, limit: float) -> bool:

@@ -13,6 +13,7 @@ MOST_OF_SPREAD = 100_000  # pixels from which the width of a distribution is tak
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from the values within
 FAR_FRAME = 5.0  # deviations beyond which a frame's offset is an outlier
 OUTLYING = 6.0  # deviations beyond which a pixel's temporal variance is not its noise
+NEIGHBOURS = 32  # pixels of a row that are compared with each other
 FEWEST_ROWS = 24  # enough for the offset of a column in a frame
 
 
@@ -132,3 +133,12 @@ def _moments(flat: np.ndarray, added: np.float32) -> tuple[np.ndarray, np.ndarra
     if len(flat) < 2:
         return level, np.full_like(level, np.nan), peak
     return level, np.einsum("fp,fp->p", off, off) / np.float32(len(flat) - 1) - added, peak
+
+
+def of_neighbours(values: np.ndarray, columns: int) -> np.ndarray:
+    """Median of the run of NEIGHBOURS pixels of its row in which each pixel lies; the last run may be longer."""
+    rows, out = values.reshape(-1, columns), np.empty(values.shape, values.dtype).reshape(-1, columns)
+    starts = np.arange(0, max(columns - NEIGHBOURS + 1, 1), NEIGHBOURS)
+    for start, stop in zip(starts, [*starts[1:], columns], strict=True):
+        out[:, start:stop] = np.median(rows[:, start:stop], axis=1, keepdims=True)
+    return out.ravel()

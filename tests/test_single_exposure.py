@@ -1,0 +1,103 @@
+"""Bias frames and a few flats, as a CCD's owner has them: clipping, warm pixels, slow rows, a vignette."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise._core.coloured import EXPONENTS, exponent_of, fading_power
+from hsnoise.statistics.pixels.flags import FLAGS, flags_of
+from hsnoise.statistics.pixels.survey import survey
+
+GAIN, READ_E, BLACK_DN, SHAPE, WARM, CHARGE_E, SLOW_E = 2.2, 16.0, 105.0, (192, 256), 0.03, 40.0, 1.2
+
+
+class Ccd:
+    """Read noise that clips at 0 in 0.2 % of the counts, warm pixels in bias frames, row noise of slow rows."""
+
+    def __init__(self, seed=0, exponent=1.5):
+        self.rng = np.random.default_rng(seed)
+        hot = self.rng.random(SHAPE) < WARM
+        self.warm_e = np.where(hot, self.rng.exponential(CHARGE_E, SHAPE), 0.0)
+        frequency = np.abs(np.fft.rfftfreq(SHAPE[0], 1 / SHAPE[0]))
+        self.slow = np.where(frequency > 0, np.maximum(frequency, 1.0) ** (-exponent / 2), 0.0)
+
+    def rows(self, n):
+        white = np.fft.rfft(self.rng.standard_normal((n, SHAPE[0])), axis=1)
+        series = np.fft.irfft(white * self.slow, SHAPE[0], axis=1)
+        return SLOW_E * series / np.sqrt((series**2).mean())
+
+    def frames(self, n, light_e=0.0):
+        electrons = self.rng.poisson(self.warm_e + light_e, (n, *SHAPE)) + READ_E * self.rng.standard_normal(
+            (n, *SHAPE)
+        )
+        return np.clip(np.rint(BLACK_DN + GAIN * (electrons + self.rows(n)[:, :, None])), 0, 65535).astype(np.uint16)
+
+    def stack(self):
+        # Light falls to a hundredth in a corner: a spectrograph's slit, a small lens.
+        y, x = np.meshgrid(np.linspace(0, 1, SHAPE[0]), np.linspace(0, 1, SHAPE[1]), indexing="ij")
+        self.light_e = 8000 * np.clip(1.2 - np.hypot(x - 0.3, y - 0.4), 0.01, 1)
+        groups = [self.frames(8), *(self.frames(4, f * self.light_e) for f in (0.25, 1.0))]
+        return hsnoise.FrameStack(
+            groups, (0.0, 1.0, 4.0), kind=("dark", "flat", "flat"), white_level=65535, shutter="global"
+        )
+
+
+@pytest.fixture(scope="module")
+def ccd():
+    sensor = Ccd()
+    stack = sensor.stack()
+    return sensor, stack, hsnoise.fit(stack)
+
+
+def within(fit, name, truth, share=0.0):
+    value, error, _ = fit.table[name]
+    assert abs(value - truth) < max(4 * error, share * truth), f"{name}: {value} +- {error}, truth {truth}"
+
+
+def test_darks_that_clip_a_little_leave_the_flats_their_gain(ccd):
+    _, stack, fit = ccd
+    assert 0.001 < np.mean([(frame == 0).mean() for frame in stack.frames(0)]) < 0.01
+    within(fit, "gain", GAIN, 0.01)
+    within(fit, "read_noise.sigma", READ_E, 0.01)
+
+
+def test_warm_pixels_of_bias_frames_are_in_the_model(ccd):
+    sensor, stack, fit = ccd
+    within(fit, "hot_pixels.fraction", WARM, 0.1)
+    within(fit, "hot_pixels.at_readout", CHARGE_E, 0.1)
+    mean = np.mean([frame.mean() for frame in stack.frames(0)])
+    charge = fit.table["hot_pixels.fraction"][0] * fit.table["hot_pixels.at_readout"][0]
+    assert fit.table["black_level"][0] + GAIN * charge == pytest.approx(mean, abs=0.3)
+
+
+def test_rows_that_are_not_white_have_an_exponent(ccd):
+    _, _, fit = ccd
+    within(fit, "row_noise.sigma", SLOW_E, 0.1)
+    within(fit, "row_noise.exponent", 1.5)
+    assert fit.table["row_noise.exponent"][1] < 0.5
+
+
+def test_dim_corners_are_not_dead_and_pixels_that_see_nothing_are(ccd):
+    sensor, _, _ = ccd
+    blind = np.zeros(SHAPE, bool)
+    blind[50, ::16], blind[:, -12:] = True, True  # among others that respond, and a stripe of overscan
+    counts = [sensor.frames(4), sensor.frames(4, np.where(blind, 0.0, sensor.light_e))]
+    found = flags_of(survey(hsnoise.FrameStack(counts, (0.0, 1.0), kind=("dark", "flat"))), 0) & FLAGS["dead"] > 0
+    missed = blind & ~found.reshape(SHAPE) & (sensor.light_e > 300)
+    assert missed[50].mean() < 0.01 and missed[:, -12:].mean() < 0.2
+    assert (found.reshape(SHAPE) & ~blind).mean() < 0.002
+
+
+@pytest.mark.parametrize(("exponent", "lag"), [(-1.0, 1), (0.5, 1), (2.0, 1), (0.5, 2), (2.0, 2)])
+def test_exponent_of_a_correlation_is_that_of_the_spectrum(exponent, lag):
+    n = 128
+    power = np.array(fading_power(n, np.float32(exponent)), float)
+    power[0] = 0
+    correlation = float((power * np.cos(2 * np.pi * lag * np.arange(n) / n)).sum() / power.sum())
+    assert exponent_of(correlation, n, lag) == pytest.approx(exponent, abs=0.01)
+
+
+def test_exponent_of_what_no_power_law_reaches_is_at_a_bound():
+    assert (exponent_of(-0.99, 64), exponent_of(1.0, 64)) == EXPONENTS
