@@ -17,6 +17,7 @@ from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
+SURFACE_DEGREE = 3  # of the light on flats
 SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
 
 
@@ -99,10 +100,15 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
 def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
     """Mean of an exposure [row, column], DN, of each plane of the Bayer pattern without what pixels differ by.
 
-    The light of real flats has edges (a slit, dust, a vignette) that no low polynomial follows.
+    A cubic surface, which goes on to the edges, and what is left of it, smoothed: the light of real flats has edges
+    of its own (a slit, dust, a vignette).
     """
     mean = np.mean([frame.astype(np.float32) for frame in like.frames(exposure)], axis=0, dtype=np.float64)
     step, smooth = len(cfa_tile(like.cfa)), np.empty(like.shape)
     for r, c in np.ndindex(step, step):
-        smooth[r::step, c::step] = scipy.ndimage.gaussian_filter(mean[r::step, c::step], SMOOTH_PIXELS, mode="nearest")
+        plane = mean[r::step, c::step]
+        down, across = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n), SURFACE_DEGREE) for n in plane.shape)
+        surface = down @ (np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T) @ across.T
+        left = scipy.ndimage.gaussian_filter(plane - surface, SMOOTH_PIXELS, mode="mirror")
+        smooth[r::step, c::step] = surface + left
     return smooth
