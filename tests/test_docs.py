@@ -35,6 +35,8 @@ IN_LITTLE = {
     "train": ["--steps", "2", "--preset", "smoke"],
     "evaluate": ["--no-rivals", "--crop", "32"],
 }
+# Their code runs by default: everyone's first page, and two in seconds; that of the others takes minutes.
+QUICK = ("README", "capture-guide", "files")
 # Candidates of a diagnosis: what the pages' captures have, and what resembles it.
 FEW = ("row_noise", "column_fixed_pattern", "photo_response_nonuniformity", "dark_current_drift", "frame_offset")
 
@@ -148,8 +150,15 @@ def test_every_block_says_what_it_is(page):
             assert not re.match(r"(\$ )?(hsnoise|pip|make|python|import|from) ", block), block
 
 
-@pytest.mark.parametrize("page", [p for p in (*PAGES, NOTEBOOK) if CODE & {kind for kind, _ in blocks(p)}], ids=name_of)
-@pytest.mark.parametrize("library", ["few", pytest.param("whole", marks=pytest.mark.slow)])
+RUNS = [
+    pytest.param(page, library, id=f"{library}-{name_of(page)}", marks=() if quick else pytest.mark.slow)
+    for page in (*PAGES, NOTEBOOK)
+    if CODE & {kind for kind, _ in blocks(page)}
+    for library, quick in (("few", page.stem in QUICK), ("whole", False))
+]
+
+
+@pytest.mark.parametrize(("page", "library"), RUNS)
 def test_page_runs(page, library, folder, request, monkeypatch, capsys):
     if library == "few":
         request.getfixturevalue("few_candidates")

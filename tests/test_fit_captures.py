@@ -42,7 +42,8 @@ def test_flats_alone_need_a_black_level(rng):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("case", ["a", pytest.param("b", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["a", "b"])
 def test_cases_of_another_simulator_are_recovered(shared_data, case):
     answers = json.loads((shared_data / "cases" / "answers.json").read_text())[f"case_{case}"]["base"]
     with np.load(shared_data / "cases" / f"case_{case}.npz") as stored:

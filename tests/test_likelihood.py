@@ -107,7 +107,7 @@ def row_integral(model, c, pixels, mean_e, sigma_e):
 @pytest.mark.parametrize(
     ("cfa", "keywords"),
     [
-        ("mono", {}),
+        pytest.param("mono", {}, marks=pytest.mark.slow),
         ("mono", {"black_level_dn": 20.3, "white_level_dn": 40}),
         ("GBRG", {"black_level_dn": 4.0}),
     ],
@@ -123,7 +123,7 @@ def moved(model, factor):
     return eqx.tree_at(lambda m: (m["gain"].value, m["read_noise"].sigma), model, replace_fn=lambda x: x * factor)
 
 
-@pytest.mark.parametrize("shutter", ["global", "rolling"])
+@pytest.mark.parametrize("shutter", [pytest.param("global", marks=pytest.mark.slow), "rolling"])
 def test_gradient_matches_differences(shutter):
     model = camera(shutter=shutter, black_level_dn=10.0)
     summary = hsnoise.summarise(capture(model, shape=(32, 64)))
@@ -156,7 +156,7 @@ def test_jit_vmap_and_a_float32_session_give_the_same():
     assert all(np.isfinite(np.asarray(g)).all() for g in jax.tree.leaves(gradient))
 
 
-@pytest.mark.parametrize("row_gain", [True, False])
+@pytest.mark.parametrize("row_gain", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bins_that_no_row_uses_make_no_difference(row_gain, monkeypatch):
     """Left out by `plan_rules`, or put in again by `replan`; hot pixels are far out, in the last, open bin, too."""
     model = camera(shutter="global", black_level_dn=40.0)
@@ -191,7 +191,9 @@ def test_rules_hold_away_from_where_they_were_made():
         np.testing.assert_allclose(float(ours), float(own), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(("rate", "gain"), [(1.7, 1.0), (0.5, 1.0), (1.0, 0.65), (1.3, 1.3)])
+@pytest.mark.parametrize(
+    ("rate", "gain"), [(1.7, 1.0), pytest.param(0.5, 1.0, marks=pytest.mark.slow), (1.0, 0.65), (1.3, 1.3)]
+)
 def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, gain):
     """Coloured rows have no common offset that could take up a wrong mean."""
     model = camera(shutter="rolling", black_level_dn=10.0)

@@ -244,7 +244,12 @@ def truth_of(model):
 
 @pytest.mark.parametrize(
     ("camera", "black", "captures"),
-    [(canon_5d3, 0.0, 5), (canon_5d3, 5.0, 3), (canon_5d3, 128.0, 4), (grasshopper3, 0.0, 5)],
+    [
+        (canon_5d3, 0.0, 5),
+        pytest.param(canon_5d3, 5.0, 3, marks=pytest.mark.slow),
+        (canon_5d3, 128.0, 4),
+        pytest.param(grasshopper3, 0.0, 5, marks=pytest.mark.slow),
+    ],
 )
 def test_line_fit_recovers_the_paper(camera, black, captures):
     """Mean over captures within 5 of its standard errors; the errors the fit claims agree with the spread."""

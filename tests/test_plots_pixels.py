@@ -77,7 +77,14 @@ def drawn(figure) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("options", [(), ("RGGB",), ("mono", TIMES, True)], ids=["mono", "bayer", "flats"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param((), id="mono"),
+        pytest.param(("RGGB",), id="bayer", marks=pytest.mark.slow),
+        pytest.param(("mono", TIMES, True), id="flats"),
+    ],
+)
 def test_every_figure_of_a_fit_can_be_drawn_and_names_its_axes(options):
     figures = plots.of_fit(fitted(*options))
     assert {"photon_transfer", "histograms", "row_spectrum", "pixel_transfer", "dark_current", "pixel_map"} == set(

@@ -144,10 +144,15 @@ def test_a_page_stands_alone(pages, command):
 @pytest.mark.parametrize(
     ("names", "misfit", "words"),
     [
-        (("row_noise",), 1.2, "No group of statistics stands out with row_noise in the model. Single statistics"),
+        pytest.param(
+            ("row_noise",),
+            1.2,
+            "No group of statistics stands out with row_noise in the model. Single statistics",
+            marks=pytest.mark.slow,
+        ),
         (("row_noise",), 7.2, "Still off with row_noise at the first estimate (the worst group, row x frame, by"),
         ((), 1.2, "No group of statistics stands out. Single statistics that are off by more than 3"),
-        ((), 7.2, "Far off (the worst group, row x frame, by 7.2 deviations)"),
+        pytest.param((), 7.2, "Far off (the worst group, row x frame, by 7.2 deviations)", marks=pytest.mark.slow),
     ],
 )
 def test_what_is_left_is_called_so_only_if_it_stands_out(names, misfit, words, stack, compared):
@@ -300,7 +305,7 @@ def test_a_page_of_an_unfinished_story_says_so(stack, story):
 
 def test_a_page_of_a_large_sensor_is_small():
     rng = np.random.default_rng(3)
-    counts = rng.normal(70, 6, (1, 2, 2000, 3000)).round().astype(np.uint16)
+    counts = rng.normal(70, 6, (1, 2, 1000, 1500)).round().astype(np.uint16)
     large = hsnoise.FrameStack(counts, [0.2], cfa=PLAIN.cfa, shutter=PLAIN.shutter)
     page = report.page(comparison(), large, fit=PLAIN)
     assert len(page.encode()) < 3_000_000 and "The middle 240 x 320 pixels" in page

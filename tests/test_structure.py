@@ -61,7 +61,7 @@ NOTHING = (
     AmplifierGlow(0.0, 0.3),
     DarkCurrentNonuniformity(0.0),
     RandomTelegraphNoise(0.0, 0.0, 0.4),
-    HeavyTailedReadNoise(1e6),
+    HeavyTailedReadNoise(1e4),
     ReadNoiseNonuniformity(0.0),
     PeriodicBanding(0.0, 0.13),
     Crosstalk(0.0),

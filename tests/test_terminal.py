@@ -38,7 +38,7 @@ def capture(tmp_path_factory) -> Path:
 def found(capture):
     """A fit with more to say than a screen holds, and what the other commands would find, without their work."""
     stack = hsnoise.load(capture)
-    fit = replace(hsnoise.fit(stack), notes=NOTES, doubts=DOUBTS)
+    fit = replace(hsnoise.fit(stack, method="line"), notes=NOTES, doubts=DOUBTS)
     comparison = hsnoise.compare(fit.params, stack, draws=8)
     effects = [hsnoise.effects.RowNoise(1.0), hsnoise.effects.ColumnNoise(1.0), hsnoise.effects.FrameOffset(1.0)]
     ranking = tuple(Candidate(one.name, one, 90.0 - 9 * i, 1e-9, 3.0) for i, one in enumerate(effects))
