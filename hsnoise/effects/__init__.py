@@ -28,6 +28,7 @@ from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
 from hsnoise.effects.hot_pixels import HotPixels
 from hsnoise.effects.image_lag import ImageLag
 from hsnoise.effects.measured_distribution import MeasuredDistribution
+from hsnoise.effects.measured_hits import MeasuredHits
 from hsnoise.effects.measured_map import MeasuredMap
 from hsnoise.effects.measured_response import MeasuredResponse
 from hsnoise.effects.measured_spectrum import MeasuredSpectrum
@@ -87,6 +88,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     MeasuredMap,
     MeasuredSpectrum,
     MeasuredDistribution,
+    MeasuredHits,
     MeasuredResponse,
 )
 
@@ -116,6 +118,7 @@ __all__ = [
     "ImageLag",
     "Maker",
     "MeasuredDistribution",
+    "MeasuredHits",
     "MeasuredMap",
     "MeasuredResponse",
     "MeasuredSpectrum",

@@ -56,6 +56,14 @@ class MeasuredMap(AbstractEffect):
         summary_unit="%",
         doc="read noise of each pixel over its rms",
     )
+    dark_fluctuation: jax.Array | None = measured(
+        "1",
+        ("row", "column"),
+        low=0,
+        summary=lambda x: 100 * float(np.sqrt(np.mean(x**2))),
+        summary_unit="%",
+        doc="relative change of each pixel's dark current from frame to frame; in tables its rms",
+    )
     first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=tuple)
 
     def __check_init__(self):
@@ -69,7 +77,13 @@ class MeasuredMap(AbstractEffect):
                 raise ValueError(f"measured_map.{field}: expected a {what} of 1, got {norm(np.asarray(value, float))}.")
 
     def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
-        return None if self.dark_current is None else self._part(self.dark_current, capture)
+        if self.dark_current is None:
+            return None
+        mean = self._part(self.dark_current, capture)
+        if self.dark_fluctuation is None:
+            return mean
+        change = self._part(self.dark_fluctuation, capture) * jax.random.normal(key, shape, mean.dtype)
+        return mean * jnp.maximum(1 + change, 0)
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
         return None if self.read_noise is None else self._part(self.read_noise, capture)

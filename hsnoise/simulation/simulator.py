@@ -31,6 +31,7 @@ class Purpose(enum.StrEnum):
     SIDE = "side of the gain"
     HELD_OUT = "held out"
     LINES = "lines"
+    CLOSE = "close"
 
 
 def key_for(seed: RandomKey | int, purpose: Purpose) -> RandomKey:
