@@ -158,11 +158,13 @@ def _jointly(estimate: np.ndarray, halves: np.ndarray, covariance: np.ndarray, r
     ]
     drawn, done = np.empty_like(estimate), []
     for q in np.argsort(relative):
-        known, own = np.zeros_like(estimate[q]), covariance[q, q]
+        own, left, of_halves = covariance[q, q], estimate[q], halves[:, q]
         for other in done:
             slope = covariance[q, other] / covariance[other, other]
-            known, own = slope * (estimate[other] - drawn[other]), own - slope * covariance[q, other]
-        drawn[q] = values_from_posterior(estimate[q] - known, halves[:, q] - known, own, rng)
+            left = left - slope * (estimate[other] - drawn[other])
+            of_halves = of_halves - slope * (halves[:, other] - drawn[other])
+            own = own - slope * covariance[q, other]
+        drawn[q] = values_from_posterior(left, of_halves, own, rng)
         done.append(q)
     return drawn
 

@@ -17,9 +17,18 @@ AXES = ("row", "column", "frame", "pixel")
 
 
 def bins_of(power: jax.Array | np.ndarray, n: int) -> jax.Array:
-    """Mean power of the n periodogram bins of a series of length n: `power` [frequency] interpolated, then mirrored."""
+    """Mean power of the n periodogram bins of a series of length n: the mean of `power` [frequency] over each bin.
+
+    Means, not single values: a line keeps its variance, however wide the bins.
+    """
+    bins = len(power)
+    if bins == 1:
+        return jnp.broadcast_to(jnp.asarray(power), n)
+    edges = np.clip((np.arange(bins + 1) - 0.5) / (2 * (bins - 1)), 0, 0.5)
+    up_to = jnp.concatenate([jnp.zeros(1, jnp.asarray(power).dtype), jnp.cumsum(power * np.diff(edges))])
     frequency = np.abs(np.fft.fftfreq(n))
-    return jnp.interp(frequency, np.linspace(0, 0.5, len(power)), power)
+    low, high = (np.clip(frequency + side / (2 * n), 0, 0.5) for side in (-1, 1))
+    return (jnp.interp(high, edges, up_to) - jnp.interp(low, edges, up_to)) / (high - low)
 
 
 def _rms(power: np.ndarray) -> float:
@@ -36,7 +45,7 @@ class MeasuredSpectrum(AbstractEffect):
 
     Each spectrum is given at equally spaced frequencies from 0 to 0.5 cycles per pixel (or frame): the mean power of
     the periodogram |FFT|^2 / n, so that white noise has its variance at every frequency. Series of other lengths take
-    the same spectrum, interpolated.
+    the same spectrum, averaged over their bins.
 
     Attributes:
         row: one offset for each row of a frame; column: one for each column.

@@ -32,6 +32,7 @@ class Purpose(enum.StrEnum):
     HELD_OUT = "held out"
     LINES = "lines"
     CLOSE = "close"
+    SHARES = "shares"
 
 
 def key_for(seed: RandomKey | int, purpose: Purpose) -> RandomKey:

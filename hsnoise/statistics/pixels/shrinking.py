@@ -13,8 +13,9 @@ from scipy.ndimage import zoom
 
 BLOCK = 16  # pixels of a side over which the level of a map is even
 NEAR = 10.0  # errors from its surroundings, beyond which a pixel is what was measured
-SPACING, GRID = 0.2, 120  # of the grids: in errors, and points for variances
-STEPS = 200  # of expectation and maximisation
+BIN, SPACING, GRID = 0.05, 0.1, 120  # in errors; points of the grid of variances
+LEAST_ERROR = 0.1  # of the expected one
+STEPS = 100  # of expectation and maximisation
 RARE = 1e-3  # weight, at first, of values anywhere
 WIDEST = 12.0  # of the logarithm of a variance, beyond the typical one
 LEAST_RATIO = 1e-3  # of variances
@@ -39,19 +40,21 @@ def values_from_posterior(
     Args:
         estimate: measured; halves [half, row, column]: from two halves of the frames, whose covariance is free of the
             noise of estimation.
-        error: variance of the errors.
+        error: expected variance of the errors; beyond some of them from its surroundings a pixel is what was measured.
     """
-    sigma, even = np.sqrt(error), surroundings(estimate)
-    local = (estimate - even) / sigma
-    is_near = np.abs(local) < NEAR
-    a, b = ((half - even)[is_near] / sigma for half in halves)
-    core = max(float(np.mean(np.clip(a, -NEAR, NEAR) * np.clip(b, -NEAR, NEAR))), SPACING**2)
-    grid = np.arange(-NEAR - 2, NEAR + 2, SPACING)
-    edges = np.linspace(-NEAR, NEAR, 4 * int(NEAR / SPACING) + 1)
+    even = surroundings(estimate)
+    is_near = np.abs(estimate - even) < NEAR * np.sqrt(error)
+    local, (a, b) = (estimate - even)[is_near], (halves - even)[:, is_near]
+    width = NEAR * np.sqrt(2 * error)
+    spread = max(float(np.mean(np.clip(a, -width, width) * np.clip(b, -width, width))), 0.0)
+    # What these pixels differ by beyond that is error, whatever its cause.
+    sigma = np.sqrt(max(float(np.mean(local**2)) - spread, LEAST_ERROR * error))
+    edges = np.arange(-NEAR, NEAR + BIN, BIN) * np.sqrt(error) / sigma
+    grid = np.arange(edges[0], edges[-1], SPACING)
+    grid -= grid[np.argmin(np.abs(grid))]
+    first = np.exp(-0.5 * (grid * sigma) ** 2 / (spread + TINY)) + RARE / len(grid)
     middle = (edges[1:] + edges[:-1]) / 2
-    first = np.exp(-(grid**2) / (2 * core))
-    first = first / first.sum() + RARE / len(grid)
-    drawn = _drawn(local[is_near], edges, grid, -0.5 * (middle[:, None] - grid) ** 2, first, rng)
+    drawn = _drawn(local / sigma, edges, grid, -0.5 * (middle[:, None] - grid) ** 2, first, rng)
     found = estimate.copy()
     found[is_near] = even[is_near] + sigma * drawn
     return found
