@@ -20,8 +20,8 @@ ROUNDING = 1 / 12  # variance of rounding, DN^2
 LEAST_READ_DN2 = 0.01  # read noise that is lost in rounding
 LEAST_SHARE = 0.05  # of the usual read noise, of the quietest pixel
 SHORT = 0.25  # of the longest exposure: below, noise is read noise
-HOT_TIMES, HOT_ERRORS = 3.0, 6.0  # times the usual dark current, and errors of it, beyond which a pixel is hot
-RESOLVED = 0.02  # share of the pixels whose dark current may come out negative, if it is known of each
+HOT_TIMES = 3.0  # times the usual dark current, beyond which a pixel is hot
+LOWEST = 0.02  # share of the pixels with the least dark current, which counts as none where it comes out negative
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,13 @@ class Sensor:
         for p in range(step * step):
             at = (slice(p // step, None, step), slice(p % step, None, step))
             offset[at], growth[at] = self._levels(at)
-        read, fluctuation = self._noise(growth, gain)
+        charge = self._charge(growth, gain) if self.grows and "dark_current" in model else np.zeros(shape)
+        read, fluctuation = self._noise(charge, gain)
         maps = {"offset": offset - black_level_of(model)[channel], "read_noise": _of_mean_square_one(read / gain)}
         if self.grows and "dark_current" in model:
-            rate = growth / gain
+            rate = charge / gain
             model = model.with_value("dark_current", "rate", rate.mean())
+            maps |= {"growth": growth - charge} if np.any(growth != charge) else {}
             if rate.any():
                 maps |= {"dark_current": rate / rate.mean(), "dark_fluctuation": fluctuation}
         first = (0, 0) if self.window is None else self.window[:2]
@@ -93,9 +95,19 @@ class Sensor:
         drawn = _jointly(estimate, halves, covariance, self.rng) + lines
         if not self.grows:
             return drawn[0], np.zeros_like(drawn[0])
-        growth = _not_negative(drawn[1], np.sqrt(covariance[1, 1]))
-        middle = float((t / noise).sum() / (1 / noise).sum())  # the level there is known best
-        return drawn[0] + (drawn[1] - growth) * middle, growth
+        return drawn[0], drawn[1]
+
+    def _charge(self, growth: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """The part of each pixel's growth, DN/s, that is dark current.
+
+        Where pedestals fall as fast as dark current rises, only their sum is measured. It shows by pixels that seem to
+        lose charge; then the growth of the temporal variance says how much charge the usual pixel has.
+        """
+        if np.quantile(growth, LOWEST) >= 0:
+            return np.maximum(growth, 0)
+        variance = np.array([one.ordinary_variance() for one in self.seen])
+        shot = max(float(np.polyfit(self.exposure_s, variance, 1)[0]), 0.0) / float(gain.mean())
+        return np.maximum(growth - float(np.median(growth)) + shot, 0)
 
     def _lines(self, axis: str, at, solve: np.ndarray, estimate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means of rows or columns of each quantity, measured and drawn from the posterior [quantity, ...]."""
@@ -167,11 +179,3 @@ def _jointly(estimate: np.ndarray, halves: np.ndarray, covariance: np.ndarray, r
         drawn[q] = values_from_posterior(left, of_halves, own, rng)
         done.append(q)
     return drawn
-
-
-def _not_negative(growth: np.ndarray, error: float) -> np.ndarray:
-    """Growth of each pixel, at least 0; where it is not known of each pixel, only hot ones differ from the rest."""
-    if np.mean(growth < 0) > RESOLVED:
-        usual = max(float(np.median(growth)), 0.0)
-        growth = np.where(growth > usual + HOT_ERRORS * error, growth, usual)
-    return np.maximum(growth, 0)

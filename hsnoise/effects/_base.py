@@ -275,9 +275,14 @@ class AbstractEffect(eqx.Module):
             if not np.all(np.isfinite(value) & (value >= low) & (value <= high)):
                 expected = f"finite values in [{low}, {high}] {spec.unit}"
                 raise ValueError(f"{self.name}.{field}: expected {expected}, got {value}.")
-        for field, value in self.arrays().items():
-            if not is_traced(value):
+        arrays = self.arrays()
+        if not any(is_traced(value) for value in arrays.values()):
+            for field, value in arrays.items():
                 self.array_specs()[field].check(f"{self.name}.{field}", value)
+            self.check_arrays()
+
+    def check_arrays(self) -> None:
+        """Raise ValueError, naming the array, where measured arrays do not fit together; each has been checked."""
 
     @classmethod
     def specs(cls) -> dict[str, ParameterSpec]:

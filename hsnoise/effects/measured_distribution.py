@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.types import Frames, RandomKey, Scalar, is_traced
+from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured, param
 
@@ -68,9 +68,7 @@ class MeasuredDistribution(AbstractEffect):
         doc="quantiles for sigma = 1; in tables their excess kurtosis",
     )
 
-    def __check_init__(self):
-        if is_traced(self.quantiles):
-            return
+    def check_arrays(self) -> None:
         quantiles = np.asarray(self.quantiles, float)
         if len(quantiles) < 2 or np.any(np.diff(quantiles) < 0):
             raise ValueError("measured_distribution.quantiles: expected two quantiles or more that do not fall.")

@@ -38,6 +38,10 @@ class MeasuredHits(AbstractEffect):
         doc="quantiles of the amplitude; in tables the median",
     )
 
+    def check_arrays(self) -> None:
+        if len(self.amplitude) < 2 or np.any(np.diff(self.amplitude) < 0):
+            raise ValueError("measured_hits.amplitude: expected two quantiles or more that do not fall.")
+
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(key)
         probability = jnp.minimum(self.chance + self.rate * capture.exposure_s, 1)
@@ -45,3 +49,9 @@ class MeasuredHits(AbstractEffect):
         place = jax.random.uniform(how_much, signal.shape, signal.dtype)
         amplitude = jnp.interp(place, jnp.linspace(0, 1, len(self.amplitude), dtype=signal.dtype), self.amplitude)
         return signal + jnp.where(is_hit, amplitude, 0)
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        probability = min(float(self.chance + self.rate * capture.exposure_s), 1.0)
+        low, high = np.asarray(self.amplitude, float)[:-1], np.asarray(self.amplitude, float)[1:]
+        mean, square = np.mean((low + high) / 2), np.mean((low**2 + low * high + high**2) / 3)
+        return {"temporal": capture.offset_variance(float(probability * square - (probability * mean) ** 2))}

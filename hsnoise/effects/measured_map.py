@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.types import Frames, PixelMap, RandomKey, cfa_tile, is_traced
+from hsnoise._core.types import Frames, PixelMap, RandomKey, cfa_tile
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured
 
@@ -64,15 +64,22 @@ class MeasuredMap(AbstractEffect):
         summary_unit="%",
         doc="relative change of each pixel's dark current from frame to frame; in tables its rms",
     )
+    growth: jax.Array | None = measured(
+        "DN/s",
+        ("row", "column"),
+        summary=lambda x: float(np.sqrt(np.mean(x**2))),
+        summary_unit="DN/s",
+        doc="change of each pixel's offset with exposure that is no charge; in tables its rms",
+    )
     first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=tuple)
 
-    def __check_init__(self):
+    def check_arrays(self) -> None:
         shapes = {value.shape for value in self.arrays().values()}
         if len(shapes) > 1:
             raise ValueError(f"measured_map: expected maps of one shape, got {sorted(shapes)}.")
         for field, norm in SCALES.items():
             value = getattr(self, field)
-            if value is not None and not is_traced(value) and abs(norm(np.asarray(value, float)) - 1) > NORMALISED:
+            if value is not None and abs(norm(np.asarray(value, float)) - 1) > NORMALISED:
                 what = "mean" if field == "dark_current" else "mean square"
                 raise ValueError(f"measured_map.{field}: expected a {what} of 1, got {norm(np.asarray(value, float))}.")
 
@@ -91,6 +98,8 @@ class MeasuredMap(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal with the offsets; the effects that draw dark current and read noise apply the other maps."""
         self._tell_of_copies(capture)
+        if self.growth is not None:
+            signal = signal + capture.exposure_s * self._part(self.growth, capture)
         return signal if self.offset is None else signal + self._part(self.offset, capture)
 
     def _part(self, whole: jax.Array, capture: Capture) -> PixelMap:

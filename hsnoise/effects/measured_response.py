@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.types import Frames, RandomKey, is_traced
+from hsnoise._core.types import Frames, RandomKey
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured
 
@@ -45,9 +45,7 @@ class MeasuredResponse(AbstractEffect):
         doc="what is added at the knots; in tables the largest",
     )
 
-    def __check_init__(self):
-        if is_traced(self.level) or is_traced(self.excess):
-            return
+    def check_arrays(self) -> None:
         level, excess = np.asarray(self.level, float), np.asarray(self.excess, float)
         if level.shape != excess.shape:
             raise ValueError(

@@ -81,16 +81,17 @@ class MeasuredSpectrum(AbstractEffect):
         return signal
 
     def components(self, capture: Capture) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for axis, into in enumerate(("row_x_frame", "column_x_frame")):
-            power = getattr(self, AXES[axis])
-            if power is not None:
-                bins = np.asarray(bins_of(power, capture.shape[axis]))
-                lines, whole = capture.spread_of_lines(axis, bins / bins.mean()) if bins.any() else (0.0, 0.0)
-                found[into] = lines * float(bins.mean())
-                found["frame"] = found.get("frame", 0.0) + whole * float(bins.mean())
+        found = dict.fromkeys(("row_x_frame", "column_x_frame", "frame", "temporal"), 0.0)
+        for power, axis, own, whole in (
+            (self.row, 0, "row_x_frame", "frame"),
+            (self.column, 1, "column_x_frame", "frame"),
+            (self.pixel, 1, "temporal", "row_x_frame"),
+        ):
+            bins = np.zeros(1) if power is None else np.asarray(bins_of(power, capture.shape[axis]))
+            if bins.any():
+                shares = capture.spread_of_lines(axis, bins / bins.mean())
+                found[own] += shares[0] * float(bins.mean())
+                found[whole] += shares[1] * float(bins.mean())
         if self.frame is not None:
-            found["frame"] = found.get("frame", 0.0) + _rms(np.asarray(self.frame)) ** 2
-        if self.pixel is not None:
-            found["temporal"] = float(np.mean(bins_of(self.pixel, capture.shape[1])))
+            found["frame"] += _rms(np.asarray(self.frame)) ** 2
         return found

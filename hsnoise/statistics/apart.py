@@ -10,6 +10,7 @@ import numpy as np
 from hsnoise.statistics.spectra import periodogram
 
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from values within
+USUAL_FRAME = 3.0  # deviations up to which a frame's offset counts
 FAR_FRAME = 5.0  # deviations beyond which a frame's offset is an outlier
 HIT_SIGMAS = 8.0  # deviation of one frame from all others of a pixel that is a hit, such as a cosmic ray
 FEWEST_FRAMES = 4  # of which one can be told to be a hit
@@ -96,7 +97,7 @@ class Apart:
         """
         width = CORE_SIGMAS * core_sigma(self.rest)
         pixels = np.clip(self.rest, -width, width).reshape(-1, self.rest.shape[2])
-        usual = FAR_FRAME * core_sigma(self.frame)
+        usual = USUAL_FRAME * core_sigma(self.frame)
         found = {"row": periodogram(self.row), "column": periodogram(self.column), "pixel": periodogram(pixels)}
         found["frame"] = np.array([np.mean(np.clip(self.frame, -usual, usual) ** 2)])
         found = {axis: power / self.freedom for axis, power in found.items()}

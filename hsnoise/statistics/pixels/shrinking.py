@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import zoom
+from scipy.stats import chi2
 
 BLOCK = 16  # pixels of a side over which the level of a map is even
 NEAR = 10.0  # errors from its surroundings, beyond which a pixel is what was measured
@@ -20,6 +21,7 @@ RARE = 1e-3  # weight, at first, of values anywhere
 WIDEST = 12.0  # of the logarithm of a variance, beyond the typical one
 LEAST_RATIO = 1e-3  # of variances
 TINY = 1e-12
+CORE = (0.1587, 0.5, 0.8413)  # quantiles at one standard deviation
 
 
 def surroundings(values: np.ndarray) -> np.ndarray:
@@ -66,7 +68,11 @@ def variances_from_posterior(ratio: np.ndarray, dof: int, rng: np.random.Generat
     high = max(min(y.max(), np.median(y) + WIDEST), y.min() + LEAST_RATIO)
     edges, grid = np.linspace(y.min(), high, 4 * GRID + 1), np.linspace(y.min() / 2, high, GRID)
     off = ((edges[1:] + edges[:-1]) / 2)[:, None] - grid
-    return np.exp(_drawn(np.clip(y, y.min(), high), edges, grid, dof / 2 * (off - np.exp(off)), np.ones(GRID), rng))
+    # The widths of the cores: measured, and by chance.
+    core, chance = (np.quantile(y, CORE), np.log(chi2.ppf(CORE, dof) / dof))
+    spread = max((np.ptp(core[[0, 2]]) ** 2 - np.ptp(chance[[0, 2]]) ** 2) / 4, 0.0)
+    first = np.exp(-0.5 * (grid - core[1] + chance[1]) ** 2 / (spread + (grid[1] - grid[0]) ** 2)) + RARE / GRID
+    return np.exp(_drawn(np.clip(y, y.min(), high), edges, grid, dof / 2 * (off - np.exp(off)), first, rng))
 
 
 def _drawn(values, edges, grid, log_density, weight, rng) -> np.ndarray:
