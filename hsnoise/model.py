@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -23,16 +21,14 @@ from hsnoise._core import html as _html
 from hsnoise._core.arguments import listed, whole_number
 from hsnoise._core.data_frames import table_to_pandas
 from hsnoise._core.keys import key_of, named_key
-from hsnoise._core.output import write_atomically
 from hsnoise._core.poisson import Regime, regime_of
 from hsnoise._core.types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
 from hsnoise.chain.arguments import checked_exposure, checked_light, piece_of
 from hsnoise.chain.arrivals import merged
-from hsnoise.chain.effect_json import effect_from_json, effect_to_json
+from hsnoise.chain.effect_json import arrays_of, effect_from_json, effect_to_json
+from hsnoise.chain.model_file import read_model, write_model
 from hsnoise.chain.signals import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
-
-FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
 
 
 class NoiseModel(eqx.Module):
@@ -144,10 +140,11 @@ class NoiseModel(eqx.Module):
         rows = []
         for effect in self.effects:
             try:
-                parameters = effect.parameters(self.channels)
+                parameters, arrays = effect.parameters(self.channels), effect.summaries()
             except (TypeError, ValueError):  # no numbers: traced, batched by vmap, or shapes alone
                 return []
             rows += [(p.name, f"{p.value:.6g}", unit_in_words(p.spec.unit)) for p in parameters]
+            rows += [(name, f"{value:.6g}", unit_in_words(unit)) for name, value, unit in arrays]
             chosen = effect.settings().items()
             rows += [(f"{effect.name}.{field}", f"{value}", "") for field, value in chosen if value is not None]
         return rows
@@ -159,8 +156,10 @@ class NoiseModel(eqx.Module):
     @property
     def table(self) -> dict[str, tuple[float, float, str]]:
         """Parameter name to (value, standard error, unit), as in the table of a fit, such as {"gain.R": (1.53, nan,
-        "DN/e-"), ...}; all errors are NaN, because a model states none."""
-        return {p.name: (p.value, math.nan, p.spec.unit) for p in self.parameters()}
+        "DN/e-"), ...}; all errors are NaN, because a model states none. One number stands for each measured array."""
+        numbers = [(p.name, p.value, p.spec.unit) for p in self.parameters()]
+        arrays = [one for effect in self.effects for one in effect.summaries()]
+        return {name: (value, math.nan, unit) for name, value, unit in (*numbers, *arrays)}
 
     def to_pandas(self) -> Any:
         """`table` as a pandas DataFrame: parameter, value, standard_error, unit (needs `hsnoise[pandas]`).
@@ -170,25 +169,23 @@ class NoiseModel(eqx.Module):
         return table_to_pandas(self)
 
     def save(self, path: str | os.PathLike, *, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write the model as human-readable JSON, all or nothing.
+        """Write the model as human-readable JSON, all or nothing; measured arrays go to an .npz file beside it.
 
         Args:
-            path: file to write; an existing one is replaced.
+            path: file to write; an existing one is replaced. Arrays of model.json are in model.npz.
             provenance: where the numbers come from (camera, data, method); anything that JSON can hold.
         """
-        leaves = jax.tree.leaves(self.effects)
+        numbers = [getattr(effect, field) for effect in self.effects for field in effect.specs()]
         content = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
             "hsnoise_version": _version(),
             "provenance": dict(provenance or {}),
             "cfa": self.cfa,
             "shutter": self.shutter,
             "exposure_s": self.exposure_s,
-            "precision": str(np.result_type(*(leaf.dtype for leaf in leaves))) if leaves else "float32",
+            "precision": str(np.result_type(*(number.dtype for number in numbers))) if numbers else "float32",
             "effects": [effect_to_json(effect, self.channels) for effect in self.effects],
         }
-        write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        write_model(path, content, arrays_of(self.effects))
 
     @staticmethod
     def load(path: str | os.PathLike, effects: Iterable[type[AbstractEffect]] = ()) -> NoiseModel:
@@ -199,26 +196,17 @@ class NoiseModel(eqx.Module):
             effects: classes of its effects that are not built into hsnoise.
 
         Raises:
-            ValueError: if the file is not a noise model or holds an unknown effect, parameter or unit.
+            ValueError: if the file is not a noise model or holds an unknown effect, parameter or unit, or if its
+                measured arrays are missing, damaged or of another model.
         """
-        try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{path}: not a JSON file ({error}).") from error
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{path}: not a noise model saved by hsnoise.")
-        if content.get("format_version") != FORMAT_VERSION:
-            raise ValueError(
-                f"{path}: file format {content.get('format_version')}, written by hsnoise "
-                f"{content.get('hsnoise_version')}; this version reads format {FORMAT_VERSION}."
-            )
+        content, arrays = read_model(path)
         own = listed("effects", effects, "a list of classes of effects")
         classes = {cls.name: cls for cls in (*EFFECTS, *own)}
         try:
             with jax.enable_x64(content["precision"] == "float64"):
                 channels = channels_of(content["cfa"])
                 return NoiseModel(
-                    [effect_from_json(item, classes, channels) for item in content["effects"]],
+                    [effect_from_json(item, classes, channels, arrays) for item in content["effects"]],
                     **{field: content[field] for field in ("cfa", "shutter", "exposure_s")},
                 )
         except KeyError as error:

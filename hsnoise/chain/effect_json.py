@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hsnoise.effects import AbstractEffect
@@ -17,10 +19,29 @@ def effect_to_json(effect: AbstractEffect, channels: tuple[str, ...]) -> dict[st
         leaf = np.asarray(getattr(effect, field))
         value = dict(zip(channels, map(shortest, leaf), strict=True)) if spec.per_channel else shortest(leaf)
         parameters[field] = {"value": value, "unit": spec.unit}
-    return {"name": effect.name, "parameters": parameters, "settings": effect.settings()}
+    item = {"name": effect.name, "parameters": parameters, "settings": effect.settings()}
+    specs = effect.array_specs()
+    arrays = {
+        field: {"unit": specs[field].unit, "shape": list(value.shape), "dtype": str(value.dtype)}
+        for field, value in effect.arrays().items()
+    }
+    return {**item, "arrays": arrays} if arrays else item
 
 
-def effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]], channels: tuple[str, ...]):
+def arrays_of(effects: Iterable[AbstractEffect]) -> dict[str, np.ndarray]:
+    """The measured arrays of effects, by the names that they have in files."""
+    return {
+        f"{effect.name}.{field}": np.asarray(value) for effect in effects for field, value in effect.arrays().items()
+    }
+
+
+def effect_from_json(
+    item: Mapping,
+    classes: Mapping[str, type[AbstractEffect]],
+    channels: tuple[str, ...],
+    arrays: Mapping[str, np.ndarray] | None = None,
+):
+    """The effect of `item`; `arrays` are the measured ones of the whole model, by name."""
     name = item["name"]
     if name not in classes:
         raise ValueError(
@@ -36,4 +57,20 @@ def effect_from_json(item: Mapping, classes: Mapping[str, type[AbstractEffect]],
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")
         values[field] = np.array([value[channel] for channel in channels]) if spec.per_channel else value
-    return classes[name](**values, **item["settings"])
+    return classes[name](**values, **_measured(item, classes[name], arrays or {}), **item["settings"])
+
+
+def _measured(item: Mapping, cls: type[AbstractEffect], arrays: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
+    found = {}
+    for field, stated in item.get("arrays", {}).items():
+        name = f"{cls.name}.{field}"
+        if field not in cls.array_specs():
+            raise ValueError(f"{cls.name}: expected arrays among {sorted(cls.array_specs())}, got {field}.")
+        unit = cls.array_specs()[field].unit
+        if stated["unit"] != unit:
+            raise ValueError(f"{name}: expected unit {unit!r}, got {stated['unit']!r}.")
+        if name not in arrays:
+            raise ValueError(f"{name}: expected in the file of arrays, which has {sorted(arrays) or 'none'}.")
+        with jax.enable_x64(True):  # the array keeps its own precision
+            found[field] = jnp.asarray(arrays[name])
+    return found

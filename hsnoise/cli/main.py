@@ -170,7 +170,7 @@ def _improve(args: argparse.Namespace) -> None:
     stack = _load(args)
     args.out.mkdir(parents=True, exist_ok=True)
     start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
-    limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps}
+    limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
     _show(args, story, page_of_story(story), "story.png", stack, (f"Written to {args.out}/: {', '.join(written)}",))

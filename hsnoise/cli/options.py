@@ -147,6 +147,11 @@ def _limit_arguments(parser: argparse.ArgumentParser) -> None:
     text = "stop after this time and keep the result so far; the first fit is always finished"
     parser.add_argument("--max-minutes", type=minutes, metavar="M", help=text)
     parser.add_argument("--max-steps", type=count, metavar="N", help="add at most N effects")
+    parser.add_argument(
+        "--close",
+        action="store_true",
+        help="close the model at the end with maps, spectra and distributions measured on this sensor",
+    )
 
 
 def _method_argument(parser: argparse.ArgumentParser) -> None:

@@ -46,8 +46,15 @@ def improve_with_progress(
 
 
 def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
-    """Write the last model and the story to `out`; returns the names of the files."""
+    """Write the last model and the story to `out`; returns the names of the files.
+
+    Of a model that is closed with measured components, that of the last fit is kept as named.json.
+    """
     written = write_results(story.fit, out, {**source, "errors": list(story.errors)}, figures=False)
+    if story.closed is not None:
+        story.fit.params.save(out / "named.json", provenance=source)
+        story.params.save(out / "model.json", provenance={**source, "closed": story.closed.summary})
+        written += ["model.npz", "named.json"]
     write_atomically(out / "story.txt", f"{story}\n".encode())
     _interrupting.on_disk(f"the model so far is in {out / 'model.json'}")
     return [*written, "story.txt"]

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise.cli.table import table_of
-from hsnoise.criticism import Comparison, Diagnosis, Story
+from hsnoise.criticism import Comparison, Diagnosis, Story, shares
 from hsnoise.criticism.inspection.inspect import Inspection
 from hsnoise.criticism.sentences import LEGEND
 from hsnoise.fitting.result import TITLES, FitResult
@@ -107,11 +107,15 @@ def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
     return Page(
         conclusion=story.conclusion,
         doubts=story.fit.further_doubts,
-        tables=(_plain(story.as_table()), *fit.tables),
-        notes=tuple(one for one in (story.care, *fit.notes) if one),
+        tables=(_plain(story.as_table()), *_shares(story), *fit.tables),
+        notes=tuple(one for one in (*story.measured, story.care, *fit.notes) if one),
         rest=tuple(one for one in (*story.details, story.ended, story.split) if one),
         colour=fit.colour,
     )
+
+
+def _shares(story: Story) -> tuple[tuple[str, ...], ...]:
+    return () if story.closed is None else (_plain(shares.as_table(story.closed.shares)),)
 
 
 def page_of_inspection(found: Inspection) -> Page:

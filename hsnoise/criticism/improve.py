@@ -14,6 +14,7 @@ from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
 from hsnoise.criticism.acceptance import is_there, is_too_little, why_worse
 from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
+from hsnoise.criticism.closing import closed
 from hsnoise.criticism.compare import DRAWS, Comparison, compared
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.finding import Diagnosis
@@ -55,6 +56,7 @@ def improve(
     candidates: Any = (),
     max_minutes: float | None = None,
     max_steps: int | None = None,
+    close: bool = False,
     seed: int = 0,
     progress=None,
     keep=None,
@@ -73,6 +75,7 @@ def improve(
         max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
             fit is finished in any case); None: as long as it takes.
         max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
+        close: whether to close the last model with measured components (`Story.closed`), judged by the frames held out.
         seed: of all draws. progress: called with a sentence at each stage, "Step 1: adding row_noise; error 26.3", and
             again after each capture that is drawn, with a colon, its number, and "of 40" if it is known how many there
             will be. keep: called with the story so far, after each model that is kept, so that nothing is lost.
@@ -88,6 +91,7 @@ def improve(
         candidates=candidates,
         max_minutes=max_minutes,
         max_steps=max_steps,
+        close=close,
         seed=seed,
         keep=keep,
         **keywords,
@@ -102,6 +106,7 @@ def improved(
     candidates: Any = (),
     max_minutes: float | None = None,
     max_steps: int | None = None,
+    close: bool = False,
     seed: int = 0,
     keep=None,
     **keywords,
@@ -133,6 +138,9 @@ def improved(
             break
     story = Story(tuple(steps), ending, split)
     log.info("Improved: %s", story.ended)
+    if close:
+        work.say(_stage("closing with measured components", steps))
+        story = replace(story, closed=closed(story.fit, fitted, held_out=held_out, seed=seed))
     return story
 
 

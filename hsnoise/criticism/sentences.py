@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsnoise._core.types import unit_in_words
+from hsnoise._core.types import seconds, unit_in_words
 from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused, Verdict, has_sides
 from hsnoise.effects import AbstractEffect
 from hsnoise.fitting.result import number, rounded
+
+if TYPE_CHECKING:
+    from hsnoise.criticism.shares import Share
 
 LEGEND = (
     "score: log-likelihood ratio of this effect alone against nothing missing (similar effects score, too: the first"
@@ -247,6 +251,25 @@ def because(nearer: Sequence[str], score: float, is_nearest: bool) -> str:
 def added(step: int, name: str, reason: str, before: float, after: float, fell: str) -> str:
     """Why a step was taken, and how the error changed; fell: what else fell."""
     return f"Step {step}: added {name}, because {reason}; error {before:.2f} -> {after:.2f}{fell}."
+
+
+def closed(error: float, worst: Share) -> str:
+    """How near a model closed with measured components comes."""
+    head = f"Closed with measured components: error {error:.3g}"
+    if worst.unexplained == 0:
+        return f"{head}, no component of the noise differs beyond chance."
+    left = f"{100 * worst.unexplained_of_total:.2g} % of the variance at {seconds(worst.exposure_s)}"
+    return f"{head}; the most that it leaves unexplained is {left}, in {worst.component}."
+
+
+def replaced(by_maps: Sequence[str], overshot: Sequence[str]) -> str:
+    """Which named effects measured components stand for; empty if none."""
+    said = []
+    if by_maps:
+        said.append(f"Measured on this sensor instead of drawn for any of its make: {', '.join(by_maps)}.")
+    if overshot:
+        said.append(f"Measured whole, because the named effect does not match: {', '.join(overshot)}.")
+    return " ".join(said)
 
 
 def with_care(outcome: str) -> str:

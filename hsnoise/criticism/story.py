@@ -14,13 +14,16 @@ from rich.table import Table
 from hsnoise._core import html as _html
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
-from hsnoise.criticism import rules, sentences
+from hsnoise.criticism import rules, sentences, shares
+from hsnoise.criticism.closing import ClosedModel
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.finding import Diagnosis
 from hsnoise.criticism.outcomes import Ended, Ending, Verdict
 from hsnoise.fit import without_likelihood
 from hsnoise.fitting.result import FitResult, number
 from hsnoise.model import NoiseModel
+
+CLOSED = "closed with measured components"
 
 
 @dataclass(frozen=True)
@@ -60,11 +63,13 @@ class Story:
         steps: from the first fit to the last that was kept.
         ending: how it ended; `ended` is that in a sentence.
         split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
+        closed: the last model closed with measured components, if that was asked for.
     """
 
     steps: tuple[Step, ...]
     ending: Ending
     split: str = ""
+    closed: ClosedModel | None = None
 
     @property
     def fit(self) -> FitResult:
@@ -73,7 +78,8 @@ class Story:
 
     @property
     def params(self) -> NoiseModel:
-        return self.fit.params
+        """The model: closed with measured components if that was asked for, else that of the last fit."""
+        return self.fit.params if self.closed is None else self.closed.params
 
     @property
     def finished(self) -> bool:
@@ -135,7 +141,12 @@ class Story:
     @property
     def _closing(self) -> tuple[str, ...]:
         """How it ended, and what to bear in mind."""
-        return tuple(sentence for sentence in (self.ended, self.care, self.split) if sentence)
+        return tuple(sentence for sentence in (self.ended, self.care, self.split, *self.measured) if sentence)
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """What measured components add, in sentences; none if the model was not closed with them."""
+        return () if self.closed is None else (self.closed.summary, self.closed.static)
 
     @property
     def care(self) -> str:
@@ -165,11 +176,17 @@ class Story:
         table = Table("step", "added", "error", "held-out / nats", "worst group")
         for i, added, error, held_out, worst in self._rows():
             table.add_row(str(i), added, f"{error:.2f}", "" if np.isnan(held_out) else f"{held_out:.1f}", worst)
+        if self.closed is not None:
+            groups = self.closed.comparison.groups
+            worst, error = max(groups, key=groups.__getitem__), self.closed.comparison.error
+            table.add_row(str(len(self.steps)), CLOSED, f"{error:.2f}", "", worst)
         return table
 
     def __str__(self) -> str:
         console = Console(file=io.StringIO(), width=100, color_system=None)
         console.print(str(self.conclusion), self.as_table(), sep="\n", highlight=False, markup=False)
+        if self.closed is not None:
+            console.print(shares.as_table(self.closed.shares))
         for sentence in (*self.details, *self._closing):
             console.print(sentence, highlight=False, markup=False)
         return console.file.getvalue().rstrip()
@@ -181,6 +198,7 @@ class Story:
         return _html.fragment(
             _html.conclusion(self.conclusion),
             _html.printed(self.as_table()),
+            "" if self.closed is None else _html.printed(shares.as_table(self.closed.shares)),
             _html.details("Why each effect was added", *(_html.sentences(told, reason) for reason, told in steps)),
             _html.details("How it ended", _html.sentences(self._closing)),
         )

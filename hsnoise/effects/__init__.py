@@ -27,6 +27,11 @@ from hsnoise.effects.gain import Gain
 from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
 from hsnoise.effects.hot_pixels import HotPixels
 from hsnoise.effects.image_lag import ImageLag
+from hsnoise.effects.measured_distribution import MeasuredDistribution
+from hsnoise.effects.measured_hits import MeasuredHits
+from hsnoise.effects.measured_map import MeasuredMap
+from hsnoise.effects.measured_response import MeasuredResponse
+from hsnoise.effects.measured_spectrum import MeasuredSpectrum
 from hsnoise.effects.missing_codes import MissingCodes
 from hsnoise.effects.nonlinearity import Nonlinearity
 from hsnoise.effects.odd_even_pattern import OddEvenPattern
@@ -80,6 +85,11 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     CosmicRays,
     BlackClamp,
     Nonlinearity,
+    MeasuredMap,
+    MeasuredSpectrum,
+    MeasuredDistribution,
+    MeasuredHits,
+    MeasuredResponse,
 )
 
 __all__ = [
@@ -107,6 +117,11 @@ __all__ = [
     "HotPixels",
     "ImageLag",
     "Maker",
+    "MeasuredDistribution",
+    "MeasuredHits",
+    "MeasuredMap",
+    "MeasuredResponse",
+    "MeasuredSpectrum",
     "MissingCodes",
     "Nonlinearity",
     "OddEvenPattern",

@@ -42,7 +42,7 @@ from hsnoise._core.types import (
     is_traced,
 )
 from hsnoise.effects._facts import CaptureFacts, Maker
-from hsnoise.effects._parameters import Parameter, ParameterSpec, shortest
+from hsnoise.effects._parameters import ArraySpec, Parameter, ParameterSpec, shortest
 
 LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
 
@@ -275,12 +275,30 @@ class AbstractEffect(eqx.Module):
             if not np.all(np.isfinite(value) & (value >= low) & (value <= high)):
                 expected = f"finite values in [{low}, {high}] {spec.unit}"
                 raise ValueError(f"{self.name}.{field}: expected {expected}, got {value}.")
+        arrays = self.arrays()
+        if not any(is_traced(value) for value in arrays.values()):
+            for field, value in arrays.items():
+                self.array_specs()[field].check(f"{self.name}.{field}", value)
+            self.check_arrays()
+
+    def check_arrays(self) -> None:
+        """Raise ValueError, naming the array, where measured arrays do not fit together; each has been checked."""
 
     @classmethod
     def specs(cls) -> dict[str, ParameterSpec]:
         """Declared parameters: field name to declaration, in order."""
         declared = {field.name: field.metadata.get("parameter") for field in dataclasses.fields(cls)}
         return {name: spec for name, spec in declared.items() if spec is not None}
+
+    @classmethod
+    def array_specs(cls) -> dict[str, ArraySpec]:
+        """Declared measured arrays: field name to declaration, in order."""
+        return {f.name: f.metadata["measured"] for f in dataclasses.fields(cls) if "measured" in f.metadata}
+
+    def arrays(self) -> dict[str, jax.Array]:
+        """The measured arrays that it has, by field name."""
+        held = {name: getattr(self, name) for name in self.array_specs()}
+        return {name: value for name, value in held.items() if value is not None}
 
     @classmethod
     def with_default(cls) -> set[str]:
@@ -301,6 +319,14 @@ class AbstractEffect(eqx.Module):
         """Static fields, which are not physical parameters: field name to value."""
         static = [field.name for field in dataclasses.fields(self) if field.metadata.get("static", False)]
         return {name: getattr(self, name) for name in static}
+
+    def summaries(self) -> list[tuple[str, float, str]]:
+        """Name in tables, number and unit that stand for each measured array."""
+        specs = self.array_specs()
+        return [
+            (f"{self.name}.{field}", specs[field].summary(np.asarray(value, float)), specs[field].summary_unit)
+            for field, value in self.arrays().items()
+        ]
 
     def parameters(self, channels: tuple[str, ...]) -> list[Parameter]:
         """All numbers of the effect with their names in tables, one for each channel where channels differ.

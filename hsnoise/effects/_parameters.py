@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -95,6 +96,58 @@ def param(
     if default is None:
         return eqx.field(converter=_as_leaf, metadata=metadata)
     return eqx.field(converter=_as_leaf, metadata=metadata, default=default)
+
+
+@dataclasses.dataclass(frozen=True)
+class ArraySpec:
+    """What an effect declares about a measured array: unit, names of its axes, inclusive lower bound, meaning.
+
+    summary: the one number that stands for it in tables; summary_unit: its unit.
+    """
+
+    unit: str
+    axes: tuple[str, ...]
+    low: float | None
+    doc: str
+    summary: Callable[[np.ndarray], float]
+    summary_unit: str
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise TypeError, ValueError, naming the array, unless it has its axes and finite values in bounds."""
+        expected = f"an array [{', '.join(self.axes)}]"
+        if not isinstance(value, jax.Array):
+            raise TypeError(f"{name}: expected {expected}, got {value!r}.")
+        if value.ndim != len(self.axes) or value.size == 0:
+            raise ValueError(f"{name}: expected {expected}, got shape {value.shape}.")
+        low = -np.inf if self.low is None else self.low
+        if not np.all(np.isfinite(value) & (np.asarray(value) >= low)):
+            bound = "" if self.low is None else f" >= {self.low:g}"
+            raise ValueError(f"{name}: expected finite numbers{bound}, got {np.min(value)} to {np.max(value)}.")
+
+
+def measured(
+    unit: str,
+    axes: tuple[str, ...],
+    *,
+    summary: Callable[[np.ndarray], float],
+    summary_unit: str,
+    low: float | None = None,
+    optional: bool = True,
+    doc: str = "",
+) -> Any:
+    """Declare an array that is measured as a whole: a leaf of the effect that no fit moves, saved beside the JSON.
+
+    Args:
+        unit: of its values, "1" if they have none; low: inclusive lower bound.
+        axes: names of its axes.
+        summary: makes the one number that stands for it in tables, in summary_unit.
+        optional: whether it may be None, the default then.
+        doc: its meaning in a few words.
+    """
+    metadata = {"measured": ArraySpec(unit, axes, low, doc, summary, summary_unit)}
+    if optional:
+        return eqx.field(converter=lambda x: None if x is None else _as_leaf(x), metadata=metadata, default=None)
+    return eqx.field(converter=_as_leaf, metadata=metadata)
 
 
 def shortest(value: np.ndarray | np.floating) -> float:

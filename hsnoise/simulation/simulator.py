@@ -31,6 +31,8 @@ class Purpose(enum.StrEnum):
     SIDE = "side of the gain"
     HELD_OUT = "held out"
     LINES = "lines"
+    CLOSE = "close"
+    SHARES = "shares"
 
 
 def key_for(seed: RandomKey | int, purpose: Purpose) -> RandomKey:

@@ -36,6 +36,11 @@ from hsnoise.effects import (
     HeavyTailedReadNoise,
     HotPixels,
     ImageLag,
+    MeasuredDistribution,
+    MeasuredHits,
+    MeasuredMap,
+    MeasuredResponse,
+    MeasuredSpectrum,
     MissingCodes,
     Nonlinearity,
     OddEvenPattern,
@@ -97,6 +102,13 @@ EXAMPLES = [
     CosmicRays(5e6, 300.0),
     BlackClamp([70.0, 60.0, 65.0]),
     Nonlinearity(1e-3),
+    MeasuredMap(
+        np.arange(24.0).reshape(4, 6), np.linspace(0.5, 1.5, 24).reshape(4, 6), np.ones((4, 6)), growth=np.ones((4, 6))
+    ),
+    MeasuredSpectrum([1.0, 2.0, 1.0], [0.5, 0.5], [1.0], [0.0, 1.0, 2.0]),
+    MeasuredDistribution(2.0, [-5.94, -2.97, 2.97, 5.94]),
+    MeasuredHits(0.3, 1.0, [20.0, 30.0, 80.0]),
+    MeasuredResponse([0.0, 20.0, 40.0], [0.0, 1.0, -2.0]),
 ]
 # Effects that draw nothing, and those that act through what another effect draws.
 DETERMINISTIC = (
@@ -112,6 +124,8 @@ DETERMINISTIC = (
     | MissingCodes
     | BlackClamp
     | Nonlinearity
+    | MeasuredMap
+    | MeasuredResponse
 )
 SHAPE_READ_NOISE = HeavyTailedReadNoise | ReadNoiseNonuniformity
 each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: effect.name)
@@ -123,8 +137,25 @@ def model_of(effect):
     return NoiseModel([effect, *shaped], cfa="RGGB", shutter="rolling", exposure_s=0.1)
 
 
+def arguments(effect):
+    """What makes the same effect again."""
+    return {name: getattr(effect, name) for name in effect.specs()} | effect.arrays() | effect.settings()
+
+
 def signal():
     return np.linspace(0.0, 40.0, np.prod(SHAPE)).reshape(SHAPE)
+
+
+@pytest.mark.parametrize("effect", [e for e in EXAMPLES if e.arrays()], ids=lambda effect: effect.name)
+def test_a_measured_array_is_checked_and_named(effect):
+    for name, value in effect.arrays().items():
+        for wrong, error, message in (
+            ("loud", TypeError, r"expected an array \[.* got 'loud'"),
+            (np.zeros((1, 1, 1)), ValueError, r"expected an array \[.* got shape \(1, 1, 1\)"),
+            (np.where(np.arange(value.size).reshape(value.shape) == 0, np.nan, value), ValueError, "expected finite"),
+        ):
+            with pytest.raises(error, match=rf"{effect.name}\.{name}: {message}"):
+                type(effect)(**{**arguments(effect), name: wrong})
 
 
 def test_every_effect_has_an_example():
@@ -175,9 +206,8 @@ def test_an_offset_behind_the_gain_is_alike_in_all_colours(effect):
 @each_effect
 def test_a_parameter_that_is_no_number_is_named(effect):
     for name in effect.specs():
-        values = {field: getattr(effect, field) for field in effect.specs()}
         with pytest.raises(TypeError, match=rf"{effect.name}\.{name}: expected a number.* got 'loud'"):
-            type(effect)(**{**values, name: "loud"}, **effect.settings())
+            type(effect)(**{**arguments(effect), name: "loud"})
 
 
 @each_effect
@@ -192,8 +222,8 @@ def test_effect_is_final(effect):
 def test_parameters_are_declared(effect):
     leaves = jax.tree.leaves(effect)
     specs = effect.specs()
-    assert len(leaves) == len(specs)
-    assert all(spec.unit and spec.doc for spec in specs.values())
+    assert len(leaves) == len(specs) + len(effect.arrays())
+    assert all(spec.unit and spec.doc for spec in (*specs.values(), *effect.array_specs().values()))
     json.dumps(effect.settings())
     named = effect.parameters(("R", "G", "B"))
     assert len(named) == sum(3 if spec.per_channel else 1 for spec in specs.values())
@@ -203,13 +233,12 @@ def test_parameters_are_declared(effect):
 @each_effect
 def test_bounds_are_enforced(effect):
     for field, spec in effect.specs().items():
-        others = {name: getattr(effect, name) for name in effect.specs() if name != field}
         outside = [np.nan, np.inf]
         outside += [] if spec.low is None else [spec.low - 1]
         outside += [] if spec.high is None else [spec.high + 1]
         for value in outside:
             with pytest.raises(ValueError, match=rf"{effect.name}\.{field}: expected finite values"):
-                type(effect)(**others, **{field: value})
+                type(effect)(**{**arguments(effect), field: value})
 
 
 @each_effect
@@ -272,7 +301,7 @@ def test_gradients_are_finite(effect):
 def test_it_prints_as_it_is_written(effect):
     again = eval(repr(effect), dict(vars(hsnoise.effects)))
     assert again.settings() == effect.settings()
-    for name in effect.specs():
+    for name in (*effect.specs(), *effect.arrays()):
         np.testing.assert_allclose(getattr(again, name), getattr(effect, name), rtol=1e-5)
     shown = str(model_of(effect))
     assert all(f"{effect.name}.{name} = {value}" in shown for name, value in effect.settings().items() if value)

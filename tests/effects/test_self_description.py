@@ -33,13 +33,15 @@ NEARLY_NORMAL = 3e5  # degrees of freedom, for infinity: a table of quantiles ta
 # The photons and the rounding have no numbers.
 WITH_LIKELIHOOD = {"shot_noise", "adc", *(effect for effect, _ in IN_LIKELIHOOD)}
 
-# Why an effect has no `propose`: all of them are in every model that is fitted.
+MEASURED = ("measured_map", "measured_spectrum", "measured_distribution", "measured_hits", "measured_response")
+
+# Why an effect has no `propose`.
 NOT_PROPOSED = dict.fromkeys(
     ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc"), "of the paper's model"
-)
+) | {name: "measured by `closed`" for name in MEASURED}
 # A capture that shows everything.
 RICH = CaptureFacts(
-    effects=tuple(NOT_PROPOSED),
+    effects=tuple(name for name in NOT_PROPOSED if name not in MEASURED),
     cfa="RGGB",
     shutter="rolling",
     read_noise_e=3.5,
@@ -87,6 +89,10 @@ DECLARED = [
     fx.PeriodicBanding(2.0, 0.01),
     fx.PeriodicBanding(2.0, 0.13, "column", after_gain=True),
     fx.CosmicRays(5e6, 300.0),
+    fx.MeasuredSpectrum(row=[0.0, 2e6, 6e6], column=[3e6, 1e6]),
+    fx.MeasuredSpectrum(frame=[2e6], pixel=[1e6, 0.0, 4e6]),
+    fx.MeasuredDistribution(2.0, [-5.94, -2.97, 2.97, 5.94]),
+    fx.MeasuredHits(0.02, 0.1, [5.0, 10.0, 40.0]),
 ]
 
 

@@ -24,6 +24,11 @@ from hsnoise.effects import (
     Gain,
     HotPixels,
     ImageLag,
+    MeasuredDistribution,
+    MeasuredHits,
+    MeasuredMap,
+    MeasuredResponse,
+    MeasuredSpectrum,
     MissingCodes,
     Nonlinearity,
     OddEvenPattern,
@@ -130,6 +135,11 @@ NEUTRAL = [
     CosmicRays(0.0, 1e4),
     BlackClamp(0.0),
     Nonlinearity(0.0),
+    MeasuredMap(),
+    MeasuredSpectrum(),
+    MeasuredDistribution(0.0, [-5.94, -2.97, 2.97, 5.94]),
+    MeasuredHits(0.0, 0.0, [50.0, 60.0]),
+    MeasuredResponse([0.0, 10.0], [0.0, 0.0]),
 ]
 
 

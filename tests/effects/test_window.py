@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hsnoise.effects import AmplifierGlow, BlackShading, FrameTilt, Gain, OddEvenPattern, TapOffsets
+from hsnoise.effects import AmplifierGlow, BlackShading, FrameTilt, Gain, MeasuredMap, OddEvenPattern, TapOffsets
 from hsnoise.model import NoiseModel, sample
 
 SENSOR = (48, 96)
@@ -18,6 +18,7 @@ PLACED = [
     OddEvenPattern(2.0),
     FrameTilt(8.0),
     FrameTilt(8.0, "column"),
+    MeasuredMap(np.arange(48.0)[:, None] + 100 * np.arange(96.0)),
 ]
 
 
@@ -25,7 +26,9 @@ def model_of(*effects, cfa="mono"):
     return NoiseModel([Gain(2.0), *effects], cfa=cfa, shutter="rolling", exposure_s=1.0)
 
 
-@pytest.mark.parametrize("effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns"])
+@pytest.mark.parametrize(
+    "effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns", "map"]
+)
 @pytest.mark.parametrize(("first", "shape"), [((0, 0), (48, 96)), ((20, 31), (8, 40)), ((47, 0), (1, 96))])
 def test_a_piece_is_cut_out_of_the_sensor(effect, first, shape):
     model, sensor = model_of(effect), jax.random.key(1)

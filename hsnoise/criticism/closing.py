@@ -1,0 +1,195 @@
+"""A model closed with measured components: what no effect explains is measured, and drawn like any other effect.
+
+The maps of this sensor take the place of the effects that draw the pattern of any sensor of the make. What changes from
+frame to frame stays with the named effects as far as they are right; the rest is measured, by the difference between
+measured frames and frames drawn from the model, until they agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from hsnoise._core.arguments import seed_of
+from hsnoise.criticism import sentences, shares
+from hsnoise.criticism.budget import budget
+from hsnoise.criticism.compare import Comparison, compared
+from hsnoise.criticism.measured_maps import Sensor
+from hsnoise.criticism.measured_noise import (
+    ALLOWED,
+    capture_like,
+    mean_power,
+    misfit,
+    of_axis,
+    with_distribution,
+    with_hits,
+    with_read_noise,
+    with_spectra,
+)
+from hsnoise.criticism.shares import Share
+from hsnoise.frames.source import as_stack
+from hsnoise.frames.stack import FrameStack
+from hsnoise.model import NoiseModel
+from hsnoise.simulation.draws import check_fits, draw_capture
+from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.simulator import Purpose, key_for
+from hsnoise.statistics.apart import Apart
+
+NEEDED = ("gain", "read_noise")
+ROUNDS = 4  # draws that bring the model nearer
+# What the maps, the distribution and the hits stand for. Effects that need light or a series of frames stay.
+REPLACED = (
+    "dark_signal_nonuniformity",
+    "dark_current_nonuniformity",
+    "read_noise_nonuniformity",
+    "row_fixed_pattern",
+    "column_fixed_pattern",
+    "black_shading",
+    "tap_offsets",
+    "odd_even_pattern",
+    "amplifier_glow",
+    "hot_pixels",
+    "random_telegraph_noise",
+    "heavy_tailed_read_noise",
+    "cosmic_rays",
+    "measured_map",
+    "measured_spectrum",
+    "measured_distribution",
+    "measured_hits",
+)
+
+
+@dataclass(frozen=True)
+class ClosedModel:
+    """A model closed with measured components.
+
+    Attributes:
+        params: the NoiseModel, for `hsnoise.sample`, `save`, ...
+        named: the model that was closed.
+        replaced: its effects that the maps of this sensor, the distribution and the hits stand for.
+        overshot: its effects that drew more than there is, so that the spectra were measured whole.
+        shares: of each component of the noise budget, explained by names or only by measured components.
+        static: a sentence on the effects that are most of the static variance.
+        comparison: with frames that it was not made from, or with those that it was made from if there are no others.
+    """
+
+    params: NoiseModel
+    named: NoiseModel
+    replaced: tuple[str, ...]
+    overshot: tuple[str, ...]
+    shares: tuple[Share, ...]
+    static: str
+    comparison: Comparison
+
+    @property
+    def largest_unexplained(self) -> Share:
+        """The component whose unexplained part is the largest of the whole variance."""
+        return max(self.shares, key=lambda share: share.unexplained_of_total)
+
+    @property
+    def summary(self) -> str:
+        """How near the closed model comes, in a sentence."""
+        return sentences.closed(self.comparison.error, self.largest_unexplained)
+
+    def __str__(self) -> str:
+        replaced = sentences.replaced(self.replaced, self.overshot)
+        return "\n".join(one for one in (self.summary, shares.printed(self.shares), self.static, replaced) if one)
+
+    __repr__ = __str__
+
+
+def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: int = 0, **keywords) -> ClosedModel:
+    """Close a model with what is measured of one sensor: the best realism, and a measure of how much names explain.
+
+    Args:
+        model: a fit, or a NoiseModel with a gain and read noise.
+        stack: frames from which components are measured: a path or a list of paths, with the keywords of
+            `hsnoise.load`; a FrameStack; or an array of counts with FrameStack's keywords. Darks of two frames or more
+            are used.
+        held_out: other darks of the same sensor, to judge by; None: the frames themselves.
+        seed: of all draws.
+
+    Raises:
+        FileNotFoundError, TypeError, ValueError: what `load` or `FrameStack` refuse; a model that does not fit the
+            stack; no dark exposure of two frames.
+    """
+    params, seed = getattr(model, "params", model), seed_of("seed", seed)
+    stack = as_stack(stack, **keywords)
+    check_fits(params, stack, "model")
+    missing = [name for name in NEEDED if name not in params]
+    if missing:
+        raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
+    darks = _repeated_darks(stack)
+    judge = Portion.of(darks if held_out is None else _repeated_darks(held_out))
+    with jax.enable_x64(True):
+        found = _Closing(darks, _apart(darks), seed).closed(params)
+    key = key_for(seed, Purpose.SHARES)
+    replaced = tuple(name for name in params.names if name in REPLACED)
+    return ClosedModel(
+        params=found,
+        named=params,
+        replaced=replaced,
+        overshot=tuple(name for name in params.names if name not in (*replaced, *found.names)),
+        shares=shares.shares_of(params, found, judge.frames, key),
+        static=_static(params, judge.frames, key, replaced),
+        comparison=compared(found, judge, seed=seed),
+    )
+
+
+def _repeated_darks(stack: FrameStack) -> FrameStack:
+    """The dark exposures of two frames or more. Raises ValueError without any."""
+    chosen = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] > 1]
+    if not chosen:
+        raise ValueError("stack: expected two frames or more of a dark exposure, to tell what stays from what changes")
+    return stack.select(exposures=chosen)
+
+
+def _static(named: NoiseModel, frames: FrameStack, key, effects: tuple[str, ...]) -> str:
+    longest = frames.select(exposures=[int(np.argmax(frames.exposure_s))])
+    return shares.in_words(shares.static_by_effect(named, frames, key, effects), shares.static_dn2(budget(longest)))
+
+
+def _apart(darks: FrameStack) -> tuple[Apart, ...]:
+    return tuple(
+        Apart.of(np.stack(list(darks.frames(i))), float(exposure_s)) for i, exposure_s in enumerate(darks.exposure_s)
+    )
+
+
+class _Closing:
+    def __init__(self, darks: FrameStack, seen: tuple[Apart, ...], seed: int):
+        self.darks, self.seen, self.key = darks, seen, key_for(seed, Purpose.CLOSE)
+        self.sensor = Sensor(seen, np.random.default_rng(seed), darks.window)
+
+    def closed(self, model: NoiseModel) -> NoiseModel:
+        for name in REPLACED:
+            if name in model:
+                model = model.remove(name)
+        model = self.named_that_hold(with_hits(self.sensor.with_map(model), self.sensor))
+        for number in range(ROUNDS):
+            drawn = self.drawn(model, number)
+            before, model = mean_power(model), with_spectra(model, self.seen, drawn)
+            model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
+            if number == 0:
+                model = with_distribution(model, self.sensor)
+        return model
+
+    def drawn(self, model: NoiseModel, number: int) -> tuple[Apart, ...]:
+        return _apart(draw_capture(jax.random.fold_in(self.key, number), model, self.darks))
+
+    def named_that_hold(self, model: NoiseModel) -> NoiseModel:
+        """The model without effects that overshoot in rows, columns or frames: their noise is measured whole."""
+        like = capture_like(model, self.darks.shape, float(self.darks.exposure_s.max()))
+        axes = ("gain", "row", "column", "frame")
+        feeding = {axis: {one.name for one in model if of_axis(one, axis, like)} for axis in axes}
+        bare = model
+        for name in set().union(*feeding.values()):
+            bare = bare.remove(name)
+        with_named, without = self.drawn(model, ROUNDS), self.drawn(bare, ROUNDS)
+        for axis, names in feeding.items():
+            if misfit(axis, self.seen, with_named) > misfit(axis, self.seen, without) + ALLOWED:
+                for name in names & set(model.names):
+                    model = model.remove(name)
+        return model

@@ -1,0 +1,133 @@
+"""What each pixel of one sensor does, measured: its offset, dark current and read noise."""
+
+from __future__ import annotations
+
+import warnings
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._core.types import Frames, PixelMap, RandomKey, cfa_tile
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._parameters import measured
+
+NORMALISED = 1e-3  # relative deviation of a mean or mean square from 1 that is rounding
+SCALES = {"dark_current": np.mean, "read_noise": lambda x: np.mean(x**2)}
+
+
+class MeasuredMap(AbstractEffect):
+    """Maps of one sensor: an offset, and factors on the dark current and the read noise of each pixel.
+
+    In place of a law over pixels, such as `dark_signal_nonuniformity`, these are the pixels themselves: every draw is
+    the sensor that was measured, whatever its `sensor_key`. The offset is in DN, after the gain. The factors have a
+    mean (dark current) and a mean square (read noise) of 1, so the rate stays the mean and the sigma the rms.
+
+    Frames that are a window of the sensor take their part of the maps. Beyond the maps, or in frames of another size
+    without a window, the maps are continued by mirrored copies.
+
+    Attributes:
+        first: row and column of the sensor at which the maps begin.
+
+    Reference: Feng, Wang, Wang, Fan, Huang, "Learnability enhancement for low-light raw denoising", ACM MM 2022
+    (dark shading).
+    """
+
+    name: ClassVar[str] = "measured_map"
+    stage: ClassVar[Stage] = Stage.BLACK
+    offset: jax.Array | None = measured(
+        "DN", ("row", "column"), summary=np.std, summary_unit="DN", doc="offset of each pixel"
+    )
+    dark_current: jax.Array | None = measured(
+        "1",
+        ("row", "column"),
+        low=0,
+        summary=lambda x: 100 * float(np.std(x)),
+        summary_unit="%",
+        doc="dark current of each pixel over its mean",
+    )
+    read_noise: jax.Array | None = measured(
+        "1",
+        ("row", "column"),
+        low=0,
+        summary=lambda x: 100 * float(np.std(x)),
+        summary_unit="%",
+        doc="read noise of each pixel over its rms",
+    )
+    dark_fluctuation: jax.Array | None = measured(
+        "1",
+        ("row", "column"),
+        low=0,
+        summary=lambda x: 100 * float(np.sqrt(np.mean(x**2))),
+        summary_unit="%",
+        doc="relative change of each pixel's dark current from frame to frame; in tables its rms",
+    )
+    growth: jax.Array | None = measured(
+        "DN/s",
+        ("row", "column"),
+        summary=lambda x: float(np.sqrt(np.mean(x**2))),
+        summary_unit="DN/s",
+        doc="change of each pixel's offset with exposure that is no charge; in tables its rms",
+    )
+    first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=tuple)
+
+    def check_arrays(self) -> None:
+        shapes = {value.shape for value in self.arrays().values()}
+        if len(shapes) > 1:
+            raise ValueError(f"measured_map: expected maps of one shape, got {sorted(shapes)}.")
+        for field, norm in SCALES.items():
+            value = getattr(self, field)
+            if value is not None and abs(norm(np.asarray(value, float)) - 1) > NORMALISED:
+                what = "mean" if field == "dark_current" else "mean square"
+                raise ValueError(f"measured_map.{field}: expected a {what} of 1, got {norm(np.asarray(value, float))}.")
+
+    def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
+        if self.dark_current is None:
+            return None
+        mean = self._part(self.dark_current, capture)
+        if self.dark_fluctuation is None:
+            return mean
+        change = self._part(self.dark_fluctuation, capture) * jax.random.normal(key, shape, mean.dtype)
+        return mean * jnp.maximum(1 + change, 0)
+
+    def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
+        return None if self.read_noise is None else self._part(self.read_noise, capture)
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        """The signal with the offsets; the effects that draw dark current and read noise apply the other maps."""
+        self._tell_of_copies(capture)
+        if self.growth is not None:
+            signal = signal + capture.exposure_s * self._part(self.growth, capture)
+        return signal if self.offset is None else signal + self._part(self.offset, capture)
+
+    def _part(self, whole: jax.Array, capture: Capture) -> PixelMap:
+        """The part of a map that the frames see, [1, row, column]."""
+        cell = len(cfa_tile(capture.cfa))
+        row, column = (_mirrored(self._lines(capture, axis), whole.shape[axis], cell) for axis in (0, 1))
+        return whole[row[:, None], column[None]][None]
+
+    def _lines(self, capture: Capture, axis: int) -> np.ndarray | jax.Array:
+        """Numbers of the frames' rows or columns, counted from the first of the maps."""
+        lines = (capture.rows, capture.columns)[axis]
+        return lines if capture.window is None else lines - self.first[axis]
+
+    def _tell_of_copies(self, capture: Capture) -> None:
+        whole = next(iter(self.arrays().values()), None)
+        if whole is None or capture.moved is not None:
+            return
+        last = [self._lines(capture, axis)[[0, -1]] for axis in (0, 1)]
+        if any(of[0] < 0 or of[1] >= size for of, size in zip(last, whole.shape, strict=True)):
+            warnings.warn(
+                f"measured_map: frames of {capture.shape[0]} x {capture.shape[1]} pixels reach beyond the map of"
+                f" {whole.shape[0]} x {whole.shape[1]}, which is continued by mirrored copies",
+                stacklevel=2,
+            )
+
+
+def _mirrored(lines: np.ndarray | jax.Array, size: int, cell: int) -> jax.Array:
+    """Lines folded back into 0 ... size - 1; whole cells of the colour filter array, so that colours stay."""
+    cells = size // cell
+    number = jnp.asarray(lines // cell) % (2 * cells)
+    return jnp.where(number < cells, number, 2 * cells - 1 - number) * cell + lines % cell
