@@ -5,6 +5,7 @@ May import all but `report` and the command line.
 
 from __future__ import annotations
 
+from hsnoise.criticism.closing import ClosedModel, closed
 from hsnoise.criticism.compare import Comparison, compare
 from hsnoise.criticism.diagnose import Diagnosis, diagnose
 from hsnoise.criticism.improve import improve
@@ -14,12 +15,14 @@ from hsnoise.criticism.story import Step, Story
 
 __all__ = [
     "Candidate",
+    "ClosedModel",
     "Comparison",
     "Diagnosis",
     "Ended",
     "Step",
     "Story",
     "Verdict",
+    "closed",
     "compare",
     "diagnose",
     "improve",

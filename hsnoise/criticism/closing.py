@@ -14,9 +14,12 @@ import jax
 import numpy as np
 
 from hsnoise._core.arguments import seed_of
+from hsnoise._core.keys import named_key
+from hsnoise._core.types import RandomKey
 from hsnoise.criticism import sentences, shares
 from hsnoise.criticism.budget import budget
 from hsnoise.criticism.compare import Comparison, compared
+from hsnoise.criticism.measured_curve import with_response
 from hsnoise.criticism.measured_maps import Sensor
 from hsnoise.criticism.measured_noise import (
     ALLOWED,
@@ -36,9 +39,10 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits, draw_capture
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
-from hsnoise.statistics.apart import Apart
+from hsnoise.statistics.apart import FEWEST_FRAMES, Apart
 
 NEEDED = ("gain", "read_noise")
+MOST_COUNTS = 1 << 26  # of an exposure in memory; of larger ones the first frames
 ROUNDS = 4  # draws that bring the model nearer
 # What the maps, the distribution and the hits stand for. Effects that need light or a series of frames stay.
 REPLACED = (
@@ -59,6 +63,7 @@ REPLACED = (
     "measured_spectrum",
     "measured_distribution",
     "measured_hits",
+    "measured_response",
 )
 
 
@@ -108,7 +113,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         model: a fit, or a NoiseModel with a gain and read noise.
         stack: frames from which components are measured: a path or a list of paths, with the keywords of
             `hsnoise.load`; a FrameStack; or an array of counts with FrameStack's keywords. Darks of two frames or more
-            are used.
+            are used, and flats of five levels or more for the response.
         held_out: other darks of the same sensor, to judge by; None: the frames themselves.
         seed: of all draws.
 
@@ -125,7 +130,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     darks = _repeated_darks(stack)
     judge = Portion.of(darks if held_out is None else _repeated_darks(held_out))
     with jax.enable_x64(True):
-        found = _Closing(darks, _apart(darks), seed).closed(params)
+        found = with_response(_Closing.of(darks, seed).closed(params), stack)
     key = key_for(seed, Purpose.SHARES)
     replaced = tuple(name for name in params.names if name in REPLACED)
     return ClosedModel(
@@ -144,10 +149,11 @@ def _repeated_darks(stack: FrameStack) -> FrameStack:
     chosen = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] > 1]
     if not chosen:
         raise ValueError("stack: expected two frames or more of a dark exposure, to tell what stays from what changes")
-    return stack.select(exposures=chosen)
+    most = max(FEWEST_FRAMES, MOST_COUNTS // (stack.shape[0] * stack.shape[1]))
+    return stack.select(exposures=chosen, frames=slice(0, most))
 
 
-def _static(named: NoiseModel, frames: FrameStack, key, effects: tuple[str, ...]) -> str:
+def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tuple[str, ...]) -> str:
     longest = frames.select(exposures=[int(np.argmax(frames.exposure_s))])
     return shares.in_words(shares.static_by_effect(named, frames, key, effects), shares.static_dn2(budget(longest)))
 
@@ -158,25 +164,36 @@ def _apart(darks: FrameStack) -> tuple[Apart, ...]:
     )
 
 
+@dataclass(frozen=True)
 class _Closing:
-    def __init__(self, darks: FrameStack, seen: tuple[Apart, ...], seed: int):
-        self.darks, self.seen, self.key = darks, seen, key_for(seed, Purpose.CLOSE)
-        self.sensor = Sensor(seen, np.random.default_rng(seed), darks.window)
+    """The frames that are measured, what they were taken apart into, and the key of all draws."""
+
+    darks: FrameStack
+    sensor: Sensor
+    key: RandomKey
+
+    @staticmethod
+    def of(darks: FrameStack, seed: int) -> _Closing:
+        key = key_for(seed, Purpose.CLOSE)
+        words = np.asarray(jax.random.bits(named_key(key, "maps"), (4,), np.uint32))
+        return _Closing(darks, Sensor(_apart(darks), np.random.default_rng(words), darks.window), key)
 
     def closed(self, model: NoiseModel) -> NoiseModel:
+        """The model with maps in place of patterns, then brought nearer draw by draw."""
         for name in REPLACED:
             if name in model:
                 model = model.remove(name)
         model = self.named_that_hold(with_hits(self.sensor.with_map(model), self.sensor))
         for number in range(ROUNDS):
             drawn = self.drawn(model, number)
-            before, model = mean_power(model), with_spectra(model, self.seen, drawn)
+            before, model = mean_power(model), with_spectra(model, self.sensor.seen, drawn)
             model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
             if number == 0:
                 model = with_distribution(model, self.sensor)
         return model
 
     def drawn(self, model: NoiseModel, number: int) -> tuple[Apart, ...]:
+        """Frames drawn as the measured ones were taken, taken apart."""
         return _apart(draw_capture(jax.random.fold_in(self.key, number), model, self.darks))
 
     def named_that_hold(self, model: NoiseModel) -> NoiseModel:
@@ -189,7 +206,7 @@ class _Closing:
             bare = bare.remove(name)
         with_named, without = self.drawn(model, ROUNDS), self.drawn(bare, ROUNDS)
         for axis, names in feeding.items():
-            if misfit(axis, self.seen, with_named) > misfit(axis, self.seen, without) + ALLOWED:
+            if misfit(axis, self.sensor.seen, with_named) > misfit(axis, self.sensor.seen, without) + ALLOWED:
                 for name in names & set(model.names):
                     model = model.remove(name)
         return model

@@ -58,3 +58,8 @@ class MeasuredResponse(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         return signal + jnp.interp(signal, self.level, self.excess)
+
+    def before(self, reading: np.ndarray) -> np.ndarray:
+        """The levels, DN, that read `reading`."""
+        level, excess = np.asarray(self.level, float), np.asarray(self.excess, float)
+        return reading - np.interp(reading, level + excess, excess)

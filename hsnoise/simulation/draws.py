@@ -92,7 +92,10 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
         return np.broadcast_to(np.float32(0), like.shape)
     channel = channel_index(like.cfa, like.shape)
     dark_e = float(model["dark_current"].rate) * like.exposure_s[exposure] if "dark_current" in model else 0.0
-    above_black = _illumination_dn(like, exposure) - black_level_of(model)[channel]
+    level = _illumination_dn(like, exposure)
+    if "measured_response" in model:
+        level = model["measured_response"].before(level)
+    above_black = level - black_level_of(model)[channel]
     return np.maximum(above_black / np.asarray(model["gain"].value)[channel] - dark_e, 0.0).astype(np.float32)
 
 
