@@ -289,13 +289,25 @@ def assert_pilot_ends_where(whole, monkeypatch):
         assert 0.7 < piloted.table[name][1] / error < 1.4
 
 
-@pytest.mark.parametrize("method", ["line", pytest.param("ml", marks=pytest.mark.slow)])
-def test_a_capture_larger_than_memory_is_fitted_on_a_part_of_it_and_told(method, monkeypatch, canon_fit):
-    model, fitted = canon_fit
-    whole = hsnoise.fit(fitted.summary, method=method)
-    monkeypatch.setattr(statistics, "MOST_MIB", sum(h.counts.nbytes for h in whole.summary.histograms) / 2**20 / 2)
-    part = hsnoise.fit(capture(model), method=method)
-    assert part.method == method and max(map(abs, pulls(part, model).values())) < 4.5
+@pytest.fixture
+def little_memory(monkeypatch, canon_fit):
+    """Enough for half of the capture."""
+    histograms = canon_fit[1].summary.histograms
+    monkeypatch.setattr(statistics, "MOST_MIB", sum(h.counts.nbytes for h in histograms) / 2**20 / 2)
+
+
+def test_a_capture_larger_than_memory_is_fitted_on_a_part_of_it_and_told(little_memory, canon_fit):
+    model, _ = canon_fit
+    part = hsnoise.fit(capture(model), method="line")
+    assert max(map(abs, pulls(part, model).values())) < 4.5
+    assert "this fit uses 8 of 16 dark frames" in part.notes[0]
+
+
+@pytest.mark.slow
+def test_errors_of_a_part_are_those_of_its_frames(little_memory, canon_fit):
+    model, whole = canon_fit
+    part = hsnoise.fit(capture(model))
+    assert_recovered(part, model)
     assert "this fit uses 8 of 16 dark frames" in part.notes[0]
     # Of half the frames, or somewhat more where their histograms have fewer bins.
     for name in ("read_noise.sigma", "dark_current.rate"):

@@ -28,7 +28,12 @@ def warm() -> hsnoise.FitResult:
     return hsnoise.fit(capture(DETERMINED["CCD warm"]))
 
 
-@pytest.mark.parametrize("kind", ["CCD cool", "CMOS warm", "column pattern", "clipped at 0", "Bayer"])
+# Other tests fit the slow ones.
+KINDS = ["CCD cool", "clipped at 0", "Bayer"]
+KINDS += [pytest.param(kind, marks=pytest.mark.slow) for kind in ("CMOS warm", "column pattern")]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_gain_and_read_noise_are_those_of_the_sensor(kind):
     sensor, fit = DETERMINED[kind], hsnoise.fit(capture(DETERMINED[kind]))
     assert fit.method == "transfer"
@@ -111,7 +116,9 @@ def test_a_black_level_that_is_off_by_a_count_is_doubted(off_dn, doubted):
     assert any("black level" in doubt for doubt in fit.doubts) is doubted
 
 
-@pytest.mark.parametrize("pixels, method", [("alike", "ml"), ("differ", "transfer")])
+@pytest.mark.parametrize(
+    ("pixels", "method"), [pytest.param("alike", "ml", marks=pytest.mark.slow), ("differ", "transfer")]
+)
 def test_pixels_overrules_the_test(pixels, method):
     frames = hsnoise.sample_dark(jax.random.key(0), 4, (48, 64), hsnoise.cameras.grasshopper3(), exposure_s=0.05)
     longer = hsnoise.sample_dark(jax.random.key(1), 4, (48, 64), hsnoise.cameras.grasshopper3(), exposure_s=0.4)

@@ -73,7 +73,7 @@ def test_pulls_of_nearly_white_rows_are_one(exponent):
 def mixture():
     """A capture of a mixture, its fit with the share free from elsewhere, and that without a share."""
     model = camera(1.0, 0.3)
-    stack = capture(model, frames=16, shape=(128, 96))
+    stack = capture(model)
     return model, stack, hsnoise.fit(stack, model=with_share(model, 0.6)), hsnoise.fit(stack)
 
 

@@ -39,8 +39,8 @@ def found(capture):
     """A fit with more to say than a screen holds, and what the other commands would find, without their work."""
     stack = hsnoise.load(capture)
     fit = replace(hsnoise.fit(stack, method="line"), notes=NOTES, doubts=DOUBTS)
-    comparison = hsnoise.compare(fit.params, stack, draws=8)
     effects = [hsnoise.effects.RowNoise(1.0), hsnoise.effects.ColumnNoise(1.0), hsnoise.effects.FrameOffset(1.0)]
+    comparison = hsnoise.compare(fit.params.add(effects[0]), stack, draws=8)  # no likelihood is compiled with it
     ranking = tuple(Candidate(one.name, one, 90.0 - 9 * i, 1e-9, 3.0) for i, one in enumerate(effects))
     unexplained = Unexplained(9.0, "tails", ("tail of the first exposure (z = +9.0)",))
     diagnosis = Diagnosis(ranking, "named", ranking[0], ("row_noise",), "", unexplained)
