@@ -114,7 +114,7 @@ def page_of_story(story: Story, truth: NoiseModel | None = None) -> Page:
     )
 
 
-def _shares(story: Story) -> tuple[tuple[str, ...], ...]:
+def _shares(story: Story) -> tuple[Table, ...]:
     return () if story.closed is None else (_plain(shares.as_table(story.closed.shares)),)
 
 

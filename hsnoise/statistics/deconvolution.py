@@ -15,9 +15,9 @@ def quantiles_beside_normal(values: np.ndarray, sigma: float, probabilities: np.
     The distribution of x is free in shape: atoms on a grid, by maximum likelihood (the Richardson-Lucy iteration).
     """
     scale = WIDTH * sigma
-    reach = np.arcsinh(np.array([values.min(), values.max()]) / scale)
-    edges = scale * np.sinh(np.linspace(reach[0] - 0.01, reach[1] + 0.01, BINS))
-    atoms = scale * np.sinh(np.linspace(*reach, ATOMS))
+    low, high = (float(np.arcsinh(end / scale)) for end in (values.min(), values.max()))
+    edges = scale * np.sinh(np.linspace(low - 0.01, high + 0.01, BINS))
+    atoms = scale * np.sinh(np.linspace(low, high, ATOMS))
     counts = np.histogram(values, edges)[0]
     below = ndtr((edges[:, None] - atoms) / sigma)
     inside = np.diff(below, axis=0) + 1e-12
