@@ -10,6 +10,7 @@ import math
 
 # One definition of a model that fits: an error below FITS. 99 % of right models have less (benchmarks.rules).
 FITS = 2.0
+CLOSED_SHARE = 0.01  # of the variance, unexplained in a component of a closed model: half a percent of the rms
 CLOSE = 10.0  # an error below this: of use, with doubts; noise of the wrong kind is off by no more than its own size
 
 # A ranking of captures without anything missing names something in at most this share of them.

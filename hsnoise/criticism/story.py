@@ -105,6 +105,10 @@ class Story:
         found = self.steps[-1].diagnosis
         ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
         added = [step.added for step in self.steps if step.added]
+        if self.closed is not None:
+            named = sentences.added_in_short(added, self.errors[0], error) if added else ""
+            rest = " ".join(part for part in (named, f"{ended}.", doubt) if part)
+            return Conclusion(_light_of_closed(self.closed, last.light), self.closed.summary, rest)
         if not added:
             return Conclusion(light, f"{ended} (error {number(error)}).", doubt)
         head = sentences.added_in_short(added, self.errors[0], error)
@@ -202,6 +206,14 @@ class Story:
             _html.details("Why each effect was added", *(_html.sentences(told, reason) for reason, told in steps)),
             _html.details("How it ended", _html.sentences(self._closing)),
         )
+
+
+def _light_of_closed(closed: ClosedModel, of_fit: Light) -> Light:
+    """A closed model may be used if either error is small; its electrons are no surer than the gain of the fit."""
+    error, left = closed.comparison.error, closed.largest_unexplained.unexplained_of_total
+    if error >= rules.CLOSE and left > rules.CLOSED_SHARE:
+        return Light.RED
+    return Light.GREEN if error < rules.FITS and of_fit == Light.GREEN else Light.AMBER
 
 
 def together(before: Step, after: Step) -> str:
