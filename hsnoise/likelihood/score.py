@@ -103,7 +103,9 @@ def _tables(coordinates, at, summary: Summary, rule: RowRule, nodes) -> Tables:
     model, outliers = coordinates.at(at)
     laws = dark_laws(jax.lax.stop_gradient(model), summary.exposure_s)
     parts = binning(summary, laws, rule.channel, rule.exposure, rule.edges_dn, rule.outlier_law)
-    return jax.lax.map(lambda part: tables_of(model, outliers, *part, summary, rule.row_stride), (parts, nodes))
+    return jax.lax.map(
+        lambda part: tables_of(model, outliers, part[0], part[1], summary, rule.row_stride), (parts, nodes)
+    )
 
 
 @jit_lean
