@@ -68,6 +68,8 @@ class Sensor:
             offset[at], growth[at] = self._levels(at)
         charge = self._charge(growth, gain) if self.grows and "dark_current" in model else np.zeros(shape)
         read, fluctuation = self._noise(charge, gain)
+        if not self.grows and "dark_current" in model:  # the fit's dark current stays, and is in the level
+            offset -= gain * float(model["dark_current"].rate) * self.exposure_s[0]
         maps = {"offset": offset - black_level_of(model)[channel], "read_noise": _of_mean_square_one(read / gain)}
         if self.grows and "dark_current" in model:
             rate = charge / gain
