@@ -22,6 +22,7 @@ from skimage.io import imsave
 
 import hsnoise
 from hsnoise.cli.main import main
+from hsnoise.simulation.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -98,6 +99,15 @@ def folder(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Comparisons by eight draws of the model, for time's sake."""
+    reference = Simulator.reference
+    monkeypatch.setattr(
+        Simulator, "reference", lambda self, model, n, *first: reference(self, model, min(n, 8), *first)
+    )
+
+
 class Reader:
     """Runs a page: Python blocks share their names, commands of hsnoise run in this process."""
 
@@ -162,6 +172,8 @@ RUNS = [
 def test_page_runs(page, library, folder, request, monkeypatch, capsys):
     if library == "few":
         request.getfixturevalue("few_candidates")
+        if page.stem in QUICK:
+            request.getfixturevalue("few_draws")
     reader = Reader(page, monkeypatch, capsys)
     if page == NOTEBOOK:  # which writes all pixels
         monkeypatch.setattr(hsnoise.examples, "st8", lambda name: folder / name)

@@ -108,8 +108,9 @@ def row_integral(model, c, pixels, mean_e, sigma_e):
     ("cfa", "keywords"),
     [
         pytest.param("mono", {}, marks=pytest.mark.slow),
-        ("mono", {"black_level_dn": 20.3, "white_level_dn": 40}),
-        ("GBRG", {"black_level_dn": 4.0}),
+        pytest.param("mono", {"black_level_dn": 20.3, "white_level_dn": 40}, marks=pytest.mark.slow),
+        pytest.param("GBRG", {"black_level_dn": 4.0}, marks=pytest.mark.slow),
+        ("GBRG", {"black_level_dn": 4.3, "white_level_dn": 16}),
     ],
 )
 def test_white_rows_match_brute_force(cfa, keywords):
@@ -192,7 +193,13 @@ def test_rules_hold_away_from_where_they_were_made():
 
 
 @pytest.mark.parametrize(
-    ("rate", "gain"), [(1.7, 1.0), pytest.param(0.5, 1.0, marks=pytest.mark.slow), (1.0, 0.65), (1.3, 1.3)]
+    ("rate", "gain"),
+    [
+        (1.7, 1.0),
+        pytest.param(0.5, 1.0, marks=pytest.mark.slow),
+        pytest.param(1.0, 0.65, marks=pytest.mark.slow),
+        (1.3, 1.3),
+    ],
 )
 def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, gain):
     """Coloured rows have no common offset that could take up a wrong mean."""
