@@ -78,7 +78,8 @@ class ClosedModel:
         overshot: its effects that drew more than there is, so that the spectra were measured whole.
         shares: of each component of the noise budget, explained by names or only by measured components.
         static: a sentence on the effects that are most of the static variance.
-        comparison: with frames that it was not made from, or with those that it was made from if there are no others.
+        comparison: with frames that it was not made from, or with those that it was made from if there are no others;
+            before: that of the model that was closed, with the same frames.
     """
 
     params: NoiseModel
@@ -88,6 +89,12 @@ class ClosedModel:
     shares: tuple[Share, ...]
     static: str
     comparison: Comparison
+    before: Comparison
+
+    @property
+    def helps(self) -> bool:
+        """Whether it comes nearer than the named effects alone: where most counts clip, maps cannot be measured."""
+        return self.comparison.error < self.before.error
 
     @property
     def largest_unexplained(self) -> Share:
@@ -127,8 +134,8 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     missing = [name for name in NEEDED if name not in params]
     if missing:
         raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
-    darks = _repeated_darks(stack)
-    judge = Portion.of(darks if held_out is None else _repeated_darks(held_out))
+    darks = repeated_darks(stack)
+    judge = Portion.of(darks if held_out is None else repeated_darks(held_out))
     with jax.enable_x64(True):
         found = with_response(_Closing.of(darks, seed).closed(params), stack)
     key = key_for(seed, Purpose.SHARES)
@@ -141,10 +148,11 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         shares=shares.shares_of(params, found, judge.frames, key),
         static=_static(params, judge.frames, key, replaced),
         comparison=compared(found, judge, seed=seed),
+        before=compared(params, judge, seed=seed),
     )
 
 
-def _repeated_darks(stack: FrameStack) -> FrameStack:
+def repeated_darks(stack: FrameStack) -> FrameStack:
     """The dark exposures of two frames or more. Raises ValueError without any."""
     chosen = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] > 1]
     if not chosen:

@@ -14,7 +14,7 @@ from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
 from hsnoise.criticism.acceptance import is_there, is_too_little, why_worse
 from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
-from hsnoise.criticism.closing import closed
+from hsnoise.criticism.closing import closed, repeated_darks
 from hsnoise.criticism.compare import DRAWS, Comparison, compared
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.finding import Diagnosis
@@ -121,6 +121,8 @@ def improved(
     limit = Limit.of(max_minutes, max_steps)
     unseen = None if held_out is None else Portion.of(held_out)
     work, split = _Work(fitted, portion, unseen, seed, tell, limit), split_in_words(fitted, held_out)
+    if close:
+        repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
     first = fit(fitted, model=model)
     if not first.has_gain:
@@ -140,7 +142,11 @@ def improved(
     log.info("Improved: %s", story.ended)
     if close:
         work.say(_stage("closing with measured components", steps))
-        story = replace(story, closed=closed(story.fit, fitted, held_out=held_out, seed=seed))
+        found = closed(story.fit, fitted, held_out=held_out, seed=seed)
+        if found.helps:
+            return replace(story, closed=found)
+        errors = found.before.error, found.comparison.error
+        return replace(story, left_open=sentences.left_open(*errors))
     return story
 
 

@@ -262,6 +262,14 @@ def closed(error: float, worst: Share) -> str:
     return f"{head}; the most that it leaves unexplained is {left}, in {worst.component}."
 
 
+def left_open(named: float, closed: float) -> str:
+    """Why a model was not closed: its errors without and with measured components."""
+    return (
+        f"Not closed with measured components: with them the error of frames held out is {number(closed)}, without"
+        f" {number(named)}."
+    )
+
+
 def replaced(by_maps: Sequence[str], overshot: Sequence[str]) -> str:
     """Which named effects measured components stand for; empty if none."""
     said = []

@@ -63,13 +63,15 @@ class Story:
         steps: from the first fit to the last that was kept.
         ending: how it ended; `ended` is that in a sentence.
         split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
-        closed: the last model closed with measured components, if that was asked for.
+        closed: the last model closed with measured components, if that was asked for and came nearer.
+        left_open: why it is not closed, in a sentence, if that was asked for in vain.
     """
 
     steps: tuple[Step, ...]
     ending: Ending
     split: str = ""
     closed: ClosedModel | None = None
+    left_open: str = ""
 
     @property
     def fit(self) -> FitResult:
@@ -150,7 +152,7 @@ class Story:
     @property
     def measured(self) -> tuple[str, ...]:
         """What measured components add, in sentences; none if the model was not closed with them."""
-        return () if self.closed is None else (self.closed.summary, self.closed.static)
+        return (self.left_open,) if self.closed is None else (self.closed.summary, self.closed.static)
 
     @property
     def care(self) -> str:

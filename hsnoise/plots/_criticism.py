@@ -88,15 +88,21 @@ def story(found) -> Figure:
         found: result of `hsnoise.improve`.
     """
     names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
-    steps = [parts_of(step.comparison) for step in found.steps]
+    seen = [step.comparison for step in found.steps]
+    if found.closed is not None:
+        names.append("closed with\nmeasured components")
+        seen.append(found.closed.comparison)
+    steps = [parts_of(comparison) for comparison in seen]
     figure = new_figure(10.0, 0.42 * len(names) + 1.9, "Misfit of the model, step by step")
     axes = figure.subplots()
     longest = max(1.0, *(sum(part.decades for part in parts) for parts in steps))
-    for y, (parts, error) in enumerate(zip(steps, found.errors, strict=True)):
+    for y, (parts, comparison) in enumerate(zip(steps, seen, strict=True)):
         _stack(axes, y, parts, longest)
         end = sum(part.decades for part in parts)
         fits = "" if parts else ": no group exceeds the model's own samples"
-        axes.annotate(f"error {number(error)}{fits}", (end, y), (6, 0), textcoords="offset points", va="center")
+        axes.annotate(
+            f"error {number(comparison.error)}{fits}", (end, y), (6, 0), textcoords="offset points", va="center"
+        )
     axes.set_xlim(0, 1.16 * longest)  # room for the error
     axes.set_ylim(len(names) - 0.45, -0.55)
     axes.set_yticks(range(len(names)), names)
