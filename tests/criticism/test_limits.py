@@ -29,7 +29,7 @@ def clock(monkeypatch):
     now = SimpleNamespace(s=1000.0)
     monkeypatch.setattr(limit.time, "monotonic", lambda: now.s)
     monkeypatch.setattr(_Work, "begun", lambda self, first: [step(26.34)])
-    monkeypatch.setattr(improve, "fit", lambda *_, **__: None)
+    monkeypatch.setattr(improve, "fit", lambda *_, **__: SimpleNamespace(has_gain=True))
     return now
 
 

@@ -260,7 +260,8 @@ def test_jit_is_eager(effect):
         return effect.sample(jnp.asarray(signal()), capture, key=KEY)
 
     eager = draw(model.effects[0])
-    np.testing.assert_allclose(jax.jit(draw)(model.effects[0]), eager, rtol=1e-12)
+    # Noise is drawn in single precision, whose last digit depends on how a program is compiled.
+    np.testing.assert_allclose(jax.jit(draw)(model.effects[0]), eager, rtol=1e-6)
 
 
 @each_effect
