@@ -112,7 +112,8 @@ SQUARES = {  # of x = gain (Poisson(light + rate t) + sigma z) + black: paramete
 SOME = ["rate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gain", "sigma", "light"))]
 
 
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SQUARES)
 def test_gradient_of_an_expectation_is_that_of_its_closed_form(name):
     value, closed = SQUARES[name]
 

@@ -110,7 +110,7 @@ def short_loop(monkeypatch):
     """The loop without its draws: the first fit, and an addition made up."""
 
     def improve(stack, tell, *, keep, **_):
-        fit, groups = hsnoise.fit(stack), {"noise": 1.0}
+        fit, groups = hsnoise.fit(stack, method="line"), {"noise": 1.0}
         errors = [Comparison(error, groups, (), (), 0.5, -3.0, ()) for error in (40.0, 1.2)]
         added = replace(fit, params=fit.params.add(hsnoise.effects.RowNoise(1.0)))
         steps = [Step(fit, errors[0], None, None, -9.0, ()), Step(added, errors[1], None, "row_noise", -9.0, ())]

@@ -90,16 +90,17 @@ def test_expected_histograms_match_the_measured_ones(canon_fit):
         assert misplaced.max() < 0.05  # rows of a few frames leave their mark on the red channel
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "black"),
     [
         ("canon_5d3", 2000.0),
-        pytest.param("grasshopper3", 64.0, marks=pytest.mark.slow),
-        pytest.param("grasshopper3", 0.0, marks=pytest.mark.slow),
+        ("grasshopper3", 64.0),
+        ("grasshopper3", 0.0),
     ],
     ids=str,
 )
-@pytest.mark.parametrize("black_level", [pytest.param("known", marks=pytest.mark.slow), "unknown"])
+@pytest.mark.parametrize("black_level", ["known", "unknown"])
 def test_cameras_and_black_levels(camera, black, black_level):
     if black == 0 and black_level == "unknown":
         black = 3.0  # estimated although part of the counts is clipped

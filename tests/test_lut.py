@@ -74,7 +74,9 @@ def noise_grid(gain):
     return gain * mean_e + 0 * read_e, gain**2 * (mean_e + read_e**2)
 
 
-@pytest.mark.parametrize(("black", "white"), [(0.0, None), (5.0, None), (2.0, 120.0)])
+@pytest.mark.parametrize(
+    ("black", "white"), [pytest.param(0.0, None, marks=pytest.mark.slow), (5.0, None), (2.0, 120.0)]
+)
 def test_unclip_inverts_the_moments(black, white):
     mean, variance = noise_grid(1.53)
     keywords = dict(gain=1.53, black_level_dn=black, white_level_dn=white)

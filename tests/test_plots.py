@@ -84,6 +84,14 @@ def test_figures_name_the_effects_that_they_lack(draw):
     assert draw(more).get_suptitle().endswith("; model without row_noise")
 
 
+def test_figures_of_a_pooled_fit_are_those_of_its_likelihood():
+    fit = fitted()
+    assert set(plots.of_fit(fit)) == {"photon_transfer", "histograms", "row_spectrum"}
+    assert plots.of_fit(dataclasses.replace(fit, method="synthetic")) == {}
+    with pytest.raises(ValueError, match=r"pixel transfer needs a fit where pixels differ"):
+        plots.pixel_transfer(fit)
+
+
 def test_histograms_show_all_pixels_and_the_expected_ones():
     fit = fitted()
     figure = plots.histograms(fit)

@@ -98,17 +98,6 @@ def test_every_figure_of_a_fit_can_be_drawn_and_names_its_axes(options):
         assert "without" not in figure.get_suptitle(), name
 
 
-def test_figures_of_a_pooled_fit_are_those_of_its_likelihood():
-    truth = sensor("mono").remove("hot_pixels").remove("dark_current_nonuniformity")
-    key = jax.random.key(3)
-    counts = [hsnoise.sample_dark(key, 4, (48, 96), truth, exposure_s=t) for t in (0.1, 0.4)]
-    fit = hsnoise.fit(counts, exposure_s=(0.1, 0.4), black_level=200, shutter="global", method="line")
-    assert set(plots.of_fit(fit)) == {"photon_transfer", "histograms", "row_spectrum"}
-    assert plots.of_fit(dataclasses.replace(fit, method="synthetic")) == {}
-    with pytest.raises(ValueError, match=r"pixel transfer needs a fit where pixels differ"):
-        plots.pixel_transfer(fit)
-
-
 def test_one_dark_exposure_has_no_transfer():
     fit = hsnoise.fit(captured("mono", (4.0,)), pixels="differ")
     assert set(plots.of_fit(fit)) == {"histograms", "pixel_map"}

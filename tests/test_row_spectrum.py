@@ -140,6 +140,7 @@ def test_a_free_share_at_its_bounds_has_an_honest_error(exponent, white_share):
     assert all(abs(pull) < 4 for pull in pulls(result, model).values())
 
 
+@pytest.mark.slow
 def test_a_share_of_one_is_a_global_shutter():
     model = with_share(camera(0.7), 1.0)
     stack = capture(model)

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import hsnoise
+from hsnoise import plots
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.naming import as_options, named, setting
 from hsnoise.cli import main as cli
@@ -54,7 +56,8 @@ def found(capture):
 
 @pytest.fixture
 def printed(found, capture, tmp_path, monkeypatch, capsys):
-    """What a command prints, with options."""
+    """What a command prints, with options; of a fit's figures there is one, and it is empty."""
+    monkeypatch.setattr(plots, "of_fit", lambda _: {"histograms": Figure()})
     monkeypatch.setattr(cli, "fit_with_progress", lambda *_: found["fit"])
     monkeypatch.setattr(hsnoise, "compare", lambda *_, **__: found["compare"])
     monkeypatch.setattr(hsnoise, "diagnose", lambda *_, **__: found["diagnose"])
