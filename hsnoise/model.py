@@ -211,7 +211,7 @@ class NoiseModel(eqx.Module):
                 )
         except KeyError as error:
             raise ValueError(f"{path}: {error} is missing.") from error
-        except (TypeError, ValueError) as error:
+        except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
 
 

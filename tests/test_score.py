@@ -11,9 +11,9 @@ import pytest
 
 import hsnoise
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, RowGain, ShotNoise
-from hsnoise.fitting.gradients import likelihood_at
 from hsnoise.likelihood import score
 from hsnoise.likelihood.coordinates import coordinates_for
+from hsnoise.likelihood.gradients import likelihood_at
 from hsnoise.likelihood.plan import plan_rules
 from hsnoise.likelihood.score import Score
 from hsnoise.likelihood.summary import coding_of, summarise, without_counts

@@ -56,7 +56,9 @@ def read_model(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, np.nd
     return content, _arrays(Path(path), content["arrays"]) if "arrays" in content else {}
 
 
-def _arrays(path: Path, stated: Mapping[str, str]) -> dict[str, np.ndarray]:
+def _arrays(path: Path, stated: Any) -> dict[str, np.ndarray]:
+    if not (isinstance(stated, dict) and all(isinstance(stated.get(key), str) for key in ("file", "sha256"))):
+        raise ValueError(f'{path}: arrays: expected {{"file": ..., "sha256": ...}}, two texts, got {stated!r:.80}.')
     beside = path.with_name(Path(stated["file"]).name)
     if not beside.exists():
         raise ValueError(f"{path}: its measured arrays are in {beside.name}, which is not beside it; copy both files.")

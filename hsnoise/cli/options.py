@@ -150,7 +150,7 @@ def _limit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--close",
         action="store_true",
-        help="close the model at the end with maps, spectra and distributions measured on this sensor",
+        help="end by measuring maps, spectra and distributions of this sensor; a minute or two more",
     )
 
 

@@ -44,27 +44,6 @@ from hsnoise.statistics.apart import FEWEST_FRAMES, Apart
 NEEDED = ("gain", "read_noise")
 MOST_COUNTS = 1 << 26  # of an exposure in memory; of larger ones the first frames
 ROUNDS = 4  # draws that bring the model nearer
-# What the maps, the distribution and the hits stand for. Effects that need light or a series of frames stay.
-REPLACED = (
-    "dark_signal_nonuniformity",
-    "dark_current_nonuniformity",
-    "read_noise_nonuniformity",
-    "row_fixed_pattern",
-    "column_fixed_pattern",
-    "black_shading",
-    "tap_offsets",
-    "odd_even_pattern",
-    "amplifier_glow",
-    "hot_pixels",
-    "random_telegraph_noise",
-    "heavy_tailed_read_noise",
-    "cosmic_rays",
-    "measured_map",
-    "measured_spectrum",
-    "measured_distribution",
-    "measured_hits",
-    "measured_response",
-)
 
 
 @dataclass(frozen=True)
@@ -139,7 +118,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     with jax.enable_x64(True):
         found = with_response(_Closing.of(darks, seed).closed(params), stack)
     key = key_for(seed, Purpose.SHARES)
-    replaced = tuple(name for name in params.names if name in REPLACED)
+    replaced = tuple(effect.name for effect in params if effect.measurable)
     return ClosedModel(
         params=found,
         named=params,
@@ -163,7 +142,7 @@ def repeated_darks(stack: FrameStack) -> FrameStack:
 
 def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tuple[str, ...]) -> str:
     longest = frames.select(exposures=[int(np.argmax(frames.exposure_s))])
-    return shares.in_words(shares.static_by_effect(named, frames, key, effects), shares.static_dn2(budget(longest)))
+    return shares.in_words(shares.static_by_effect(named, longest, key, effects), shares.static_dn2(budget(longest)))
 
 
 def _apart(darks: FrameStack) -> tuple[Apart, ...]:
@@ -188,9 +167,8 @@ class _Closing:
 
     def closed(self, model: NoiseModel) -> NoiseModel:
         """The model with maps in place of patterns, then brought nearer draw by draw."""
-        for name in REPLACED:
-            if name in model:
-                model = model.remove(name)
+        for effect in [one for one in model if one.measurable]:
+            model = model.remove(effect.name)
         model = self.named_that_hold(with_hits(self.sensor.with_map(model), self.sensor))
         for number in range(ROUNDS):
             drawn = self.drawn(model, number)

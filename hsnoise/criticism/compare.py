@@ -60,12 +60,18 @@ class Comparison:
         return self.error < rules.FITS
 
     @property
+    def worst_group(self) -> str:
+        """The group of statistics with the largest misfit."""
+        return max(self.groups, key=self.groups.__getitem__)
+
+    @property
     def conclusion(self) -> Conclusion:
         """Whether the model describes the capture, and in which group of statistics it fails most."""
         if self.fits:
             return Conclusion(Light.GREEN, sentences.describes(self.error))
-        worst, is_close = max(self.groups, key=self.groups.__getitem__), self.error < rules.CLOSE
-        return Conclusion(Light.AMBER if is_close else Light.RED, sentences.fails(self.error, worst, is_close))
+        is_close = self.error < rules.CLOSE
+        light = Light.AMBER if is_close else Light.RED
+        return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close))
 
     @property
     def own_misfit(self) -> float:

@@ -75,7 +75,8 @@ def improve(
         max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
             fit is finished in any case); None: as long as it takes.
         max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
-        close: whether to close the last model with measured components (`Story.closed`), judged by the frames held out.
+        close: whether to close the last model with measured components (`Story.closed`), judged by the frames held out;
+            it takes a minute or two more, whatever max_minutes says.
         seed: of all draws. progress: called with a sentence at each stage, "Step 1: adding row_noise; error 26.3", and
             again after each capture that is drawn, with a colon, its number, and "of 40" if it is known how many there
             will be. keep: called with the story so far, after each model that is kept, so that nothing is lost.

@@ -290,7 +290,7 @@ def frames_apart(fitted: Sequence[int], held_out: Sequence[int]) -> str:
     return (
         f"The first {_span(fitted)} dark frames of each exposure were fitted and compared. held-out: log-likelihood of"
         f" the statistics of the other {_span(held_out)}, in nats (one more: 2.7 times as probable). To fit all frames:"
-        " hsnoise.fit(stack, model=story.params), or hsnoise fit --model model.json."
+        " hsnoise.fit(stack, model=story.fit.params), or hsnoise fit --model model.json (closed: named.json)."
     )
 
 

@@ -70,7 +70,8 @@ class Share(NamedTuple):
 def shares_of(named: NoiseModel, closed: NoiseModel, frames: FrameStack, key: RandomKey) -> tuple[Share, ...]:
     """The shares of each component of the noise budget of dark `frames`, by draws of both models."""
     measured = budget(frames)
-    drawn = {name: _drawn(model, frames, named_key(key, name)) for name, model in _both(named, closed)}
+    models = {"named": named, "closed": closed}
+    drawn = {name: _drawn(model, frames, named_key(key, name)) for name, model in models.items()}
     rows = []
     for i, row in enumerate(measured.rows):
         for component in COMPONENTS:
@@ -95,14 +96,9 @@ def shares_of(named: NoiseModel, closed: NoiseModel, frames: FrameStack, key: Ra
 
 
 def static_by_effect(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: Iterable[str]) -> dict[str, float]:
-    """Static variance, DN^2, that each effect of a model adds at the longest exposure; means over the colours."""
-    longest = frames.select(exposures=[int(np.argmax(frames.exposure_s))])
-    whole = _static(_drawn(named, longest, key))
-    return {name: whole - _static(_drawn(named.remove(name), longest, key)) for name in effects if name in named}
-
-
-def _both(named: NoiseModel, closed: NoiseModel) -> tuple[tuple[str, NoiseModel], ...]:
-    return ("named", named), ("closed", closed)
+    """Static variance, DN^2, that each effect of a model adds to `frames` of one exposure; means over the colours."""
+    whole = _static(_drawn(named, frames, key))
+    return {name: whole - _static(_drawn(named.remove(name), frames, key)) for name in effects if name in named}
 
 
 def _drawn(model: NoiseModel, like: FrameStack, key: RandomKey) -> list[NoiseBudget]:
@@ -114,9 +110,8 @@ def _static(found: list[NoiseBudget]) -> float:
 
 
 def static_dn2(found: NoiseBudget) -> float:
-    """Static variance of the last exposure, DN^2, mean over the colours."""
-    last = [row for row in found.rows if row.exposure_s == found.rows[-1].exposure_s]
-    return float(np.mean([sum(row.components[name].variance_dn2 for name in STATIC) for row in last]))
+    """Static variance of the budget of one exposure, DN^2, mean over the colours."""
+    return float(np.mean([sum(row.components[name].variance_dn2 for name in STATIC) for row in found.rows]))
 
 
 def _chance(name: str, of: Component) -> float:

@@ -151,8 +151,10 @@ class Story:
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """What measured components add, in sentences; none if the model was not closed with them."""
-        return (self.left_open,) if self.closed is None else (self.closed.summary, self.closed.static)
+        """What measured components add, or why they were left out, in sentences; none if they were not asked for."""
+        if self.closed is not None:
+            return self.closed.summary, self.closed.static
+        return (self.left_open,) if self.left_open else ()
 
     @property
     def care(self) -> str:
@@ -174,8 +176,8 @@ class Story:
 
     def _rows(self) -> Iterator[tuple[int, str, float, float, str]]:
         for i, step in enumerate(self.steps):
-            worst = max(step.comparison.groups, key=step.comparison.groups.__getitem__)
-            yield i, step.added or self.start, step.comparison.error, step.held_out, worst
+            found = step.comparison
+            yield i, step.added or self.start, found.error, step.held_out, found.worst_group
 
     def as_table(self) -> Table:
         """The steps, as they are printed."""
@@ -183,9 +185,8 @@ class Story:
         for i, added, error, held_out, worst in self._rows():
             table.add_row(str(i), added, f"{error:.2f}", "" if np.isnan(held_out) else f"{held_out:.1f}", worst)
         if self.closed is not None:
-            groups = self.closed.comparison.groups
-            worst, error = max(groups, key=groups.__getitem__), self.closed.comparison.error
-            table.add_row(str(len(self.steps)), CLOSED, f"{error:.2f}", "", worst)
+            found = self.closed.comparison
+            table.add_row(str(len(self.steps)), CLOSED, f"{found.error:.2f}", "", found.worst_group)
         return table
 
     def __str__(self) -> str:

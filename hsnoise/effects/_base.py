@@ -187,6 +187,8 @@ class AbstractEffect(eqx.Module):
         selection_nats: penalty on its score, nats, for a detail measured on the capture and not drawn at random.
         confounded_with: the effect that looks the same in darks, so that only flats separate them; empty if none does.
         decided_by: the capture that separates them, as a sentence of advice.
+        measurable: whether measured components of one sensor stand for it in a closed model: a map for the pattern that
+            it draws for any sensor of the make, a distribution or hits for its noise of single pixels.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -199,6 +201,7 @@ class AbstractEffect(eqx.Module):
     selection_nats: ClassVar[float] = 0.0
     confounded_with: ClassVar[str] = ""
     decided_by: ClassVar[str] = ""
+    measurable: ClassVar[bool] = False
 
     @property
     def acts_at(self) -> Stage:

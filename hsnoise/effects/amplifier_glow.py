@@ -29,6 +29,7 @@ class AmplifierGlow(AbstractEffect):
 
     name: ClassVar[str] = "amplifier_glow"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    measurable: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     rate: Scalar = param(
         "e-/s", low=0, amplitude=True, doc="electrons of a pixel in a second where the glow is brightest"

@@ -34,6 +34,7 @@ class BlackShading(AbstractEffect):
 
     name: ClassVar[str] = "black_shading"
     stage: ClassVar[Stage] = Stage.BLACK
+    measurable: ClassVar[bool] = True
     least_frames: ClassVar[int] = 2
     amplitude: Scalar = param("DN", low=0, amplitude=True, doc="rms over the columns (rows)")
     length: Scalar = param("1", low=0.003, doc="where it has fallen by e, in widths (heights) of the frame")

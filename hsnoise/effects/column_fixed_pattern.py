@@ -29,6 +29,7 @@ class ColumnFixedPattern(AbstractEffect):
 
     name: ClassVar[str] = "column_fixed_pattern"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over columns")
     after_gain: bool = eqx.field(static=True, default=False)
 

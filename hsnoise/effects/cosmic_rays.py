@@ -28,6 +28,7 @@ class CosmicRays(AbstractEffect):
 
     name: ClassVar[str] = "cosmic_rays"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    measurable: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     rate: Scalar = param(
         "1/(Mpixel s)", low=0, held="at bounds", amplitude=True, doc="hits of a million pixels in a second"

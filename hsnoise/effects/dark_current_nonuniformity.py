@@ -27,6 +27,7 @@ class DarkCurrentNonuniformity(AbstractEffect):
 
     name: ClassVar[str] = "dark_current_nonuniformity"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    measurable: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     spread: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of ln dark current over pixels")
 

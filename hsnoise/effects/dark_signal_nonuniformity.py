@@ -30,6 +30,7 @@ class DarkSignalNonuniformity(AbstractEffect):
 
     name: ClassVar[str] = "dark_signal_nonuniformity"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over pixels")
     after_gain: bool = eqx.field(static=True, default=False)
 

@@ -33,6 +33,7 @@ class HeavyTailedReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "heavy_tailed_read_noise"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     dof: Scalar = param(
         "1", low=2.05, amplitude=True, absent=math.inf, doc="degrees of freedom of Student's t; infinite is normal"
     )

@@ -36,6 +36,7 @@ class HotPixels(AbstractEffect):
 
     name: ClassVar[str] = "hot_pixels"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    measurable: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that are hot")
     rate: Scalar = param("e-/s", low=0, held="at bounds", amplitude=True, doc="mean extra dark current of a hot pixel")

@@ -27,6 +27,7 @@ class MeasuredHits(AbstractEffect):
 
     name: ClassVar[str] = "measured_hits"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     chance: Scalar = param("1", low=0, high=1, amplitude=True, doc="probability of a hit whatever the exposure")
     rate: Scalar = param("1/s", low=0, amplitude=True, doc="hits of a pixel in a second")
     amplitude: jax.Array = measured(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,6 +17,16 @@ from hsnoise.effects._parameters import measured
 
 NORMALISED = 1e-3  # relative deviation of a mean or mean square from 1 that is rounding
 SCALES = {"dark_current": np.mean, "read_noise": lambda x: np.mean(x**2)}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _factor(summary: Callable[[np.ndarray], float], doc: str) -> Any:
+    """A map of factors, of which tables show `summary` in per cent."""
+    axes = ("row", "column")
+    return measured("1", axes, low=0, summary=lambda x: 100 * float(summary(x)), summary_unit="%", doc=doc)
 
 
 class MeasuredMap(AbstractEffect):
@@ -37,37 +48,19 @@ class MeasuredMap(AbstractEffect):
 
     name: ClassVar[str] = "measured_map"
     stage: ClassVar[Stage] = Stage.BLACK
+    measurable: ClassVar[bool] = True
     offset: jax.Array | None = measured(
         "DN", ("row", "column"), summary=np.std, summary_unit="DN", doc="offset of each pixel"
     )
-    dark_current: jax.Array | None = measured(
-        "1",
-        ("row", "column"),
-        low=0,
-        summary=lambda x: 100 * float(np.std(x)),
-        summary_unit="%",
-        doc="dark current of each pixel over its mean",
-    )
-    read_noise: jax.Array | None = measured(
-        "1",
-        ("row", "column"),
-        low=0,
-        summary=lambda x: 100 * float(np.std(x)),
-        summary_unit="%",
-        doc="read noise of each pixel over its rms",
-    )
-    dark_fluctuation: jax.Array | None = measured(
-        "1",
-        ("row", "column"),
-        low=0,
-        summary=lambda x: 100 * float(np.sqrt(np.mean(x**2))),
-        summary_unit="%",
-        doc="relative change of each pixel's dark current from frame to frame; in tables its rms",
+    dark_current: jax.Array | None = _factor(np.std, "dark current of each pixel over its mean")
+    read_noise: jax.Array | None = _factor(np.std, "read noise of each pixel over its rms")
+    dark_fluctuation: jax.Array | None = _factor(
+        _rms, "relative change of each pixel's dark current from frame to frame; in tables its rms"
     )
     growth: jax.Array | None = measured(
         "DN/s",
         ("row", "column"),
-        summary=lambda x: float(np.sqrt(np.mean(x**2))),
+        summary=_rms,
         summary_unit="DN/s",
         doc="change of each pixel's offset with exposure that is no charge; in tables its rms",
     )

@@ -33,6 +33,7 @@ class MeasuredResponse(AbstractEffect):
 
     name: ClassVar[str] = "measured_response"
     stage: ClassVar[Stage] = Stage.BLACK
+    measurable: ClassVar[bool] = True
     level: jax.Array = measured(
         "DN", ("knot",), summary=np.max, summary_unit="DN", optional=False, doc="level of the knots; in tables the last"
     )

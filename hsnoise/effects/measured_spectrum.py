@@ -57,6 +57,7 @@ class MeasuredSpectrum(AbstractEffect):
 
     name: ClassVar[str] = "measured_spectrum"
     stage: ClassVar[Stage] = Stage.BLACK
+    measurable: ClassVar[bool] = True
     row: jax.Array | None = _spectrum("the offsets of rows")
     column: jax.Array | None = _spectrum("the offsets of columns")
     frame: jax.Array | None = _spectrum("the offsets of frames")

@@ -27,6 +27,7 @@ class OddEvenPattern(AbstractEffect):
 
     name: ClassVar[str] = "odd_even_pattern"
     stage: ClassVar[Stage] = Stage.READOUT
+    measurable: ClassVar[bool] = True
     offset: Scalar = param("e-", amplitude=True, doc="second chain minus first")
     gain_mismatch: Scalar = param(
         "1", low=-1, high=1, default=0.0, amplitude=True, doc="relative gain, second chain minus first"

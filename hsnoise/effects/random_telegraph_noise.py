@@ -28,6 +28,7 @@ class RandomTelegraphNoise(AbstractEffect):
 
     name: ClassVar[str] = "random_telegraph_noise"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     fraction: Scalar = param("1", low=0, high=1, doc="fraction of pixels that jump")
     amplitude: Scalar = param("e-", low=0, amplitude=True, doc="distance of the two levels")
     duty: Scalar = param("1", low=0, high=1, default=0.5, doc="probability of the high level")

@@ -28,6 +28,7 @@ class ReadNoiseNonuniformity(AbstractEffect):
 
     name: ClassVar[str] = "read_noise_nonuniformity"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     spread: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of ln sigma over pixels")
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:

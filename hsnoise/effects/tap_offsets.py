@@ -31,6 +31,7 @@ class TapOffsets(AbstractEffect):
 
     name: ClassVar[str] = "tap_offsets"
     stage: ClassVar[Stage] = Stage.READ
+    measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over taps")
     taps: int = eqx.field(static=True, default=4)
     after_gain: bool = eqx.field(static=True, default=False)

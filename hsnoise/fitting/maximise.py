@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.memory import give_back_free_memory
-from hsnoise.fitting.gradients import gradient_at, likelihood_at, parameters_at, prior_at, rules_at
 from hsnoise.likelihood.coordinates import Coordinates
 from hsnoise.likelihood.darks import Rules
+from hsnoise.likelihood.gradients import gradient_at, likelihood_at, parameters_at, prior_at, rules_at
 from hsnoise.likelihood.plan import CLOSE_MARGIN, plan_rules, replan
 from hsnoise.likelihood.summary import Summary, every_nth_row, some_frames, without_counts
 from hsnoise.model import NoiseModel

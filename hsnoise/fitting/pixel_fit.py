@@ -17,7 +17,7 @@ from hsnoise._core.coloured import exponent_of
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.decomposition import Component, mean_of
+from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.statistics.pixels.population import Population, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.sample import without_outliers
@@ -135,7 +135,8 @@ def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
     planes = _shortest(found, c)
     if not planes:
         return 0.0, np.inf
-    together, alone = (mean_of([of(p) for p in planes]) for of in (_together, _alone))
+    together = mean_of([p.rows_together for p in planes])
+    alone = mean_of([p.components["row_x_frame"] for p in planes])
     if alone.variance_dn2 <= 0 or abs(together.variance_dn2) < TOGETHER * together.chance_dn2:
         return 0.0, np.inf
     step = found.shape[0] // len(planes[0].row_mean_dn)
@@ -143,14 +144,6 @@ def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
     error = np.hypot(together.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
     low, middle, high = (exponent_of(correlation + way * error, found.shape[0], step) for way in (-1, 0, 1))
     return middle, max((high - low) / 2, LEAST_EXPONENT_ERROR)
-
-
-def _together(plane: Plane) -> Component:
-    return plane.rows_together
-
-
-def _alone(plane: Plane) -> Component:
-    return plane.components["row_x_frame"]
 
 
 def _warm(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]] | None:

@@ -136,8 +136,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
-            if name == "row_noise" and np.isfinite((exponent := _mean([c.row_exponent for c in pixel.channels]))[1]):
-                found[name]["exponent"] = exponent
+    exponent = _mean([c.row_exponent for c in pixel.channels])
+    if "row_noise" in found and np.isfinite(exponent[1]):
+        found["row_noise"]["exponent"] = exponent
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}

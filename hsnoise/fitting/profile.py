@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise.fitting.gradients import gradient_at, rules_at
 from hsnoise.fitting.maximise import Maximum, quasi_newton
 from hsnoise.likelihood.coordinates import Coordinates
+from hsnoise.likelihood.gradients import gradient_at, rules_at
 from hsnoise.likelihood.plan import replan
 from hsnoise.likelihood.summary import Summary, without_counts
 

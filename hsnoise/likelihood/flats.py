@@ -310,11 +310,11 @@ def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | 
     variance = np.maximum(sums.squares - left * left / n, 0) * np.float32(light**2 / (n - 1))
     kept = _ordinary(variance, np.maximum(relative, 1.0), n)
     typical = float(variance[kept].mean(dtype=np.float64))
-    clear = kept & _unclipped(sums, zero_dn + light * relative, typical, white_level, is_dark)
     centred = (1 - 1 / rows) * (1 - 1 / pixels)
     if is_dark and sums.lowest <= 0 and (whole := _without_clipping(zero_dn + relative[kept], typical / centred, n)):
         level, corrected, growth = whole
         return level, corrected, kept.sum() * centred * (n - 1) / growth**2, *_of_rows(sums, zero_dn, light), 1.0
+    clear = kept & _unclipped(sums, zero_dn + light * relative, typical, white_level, is_dark)
     # Frames of unequal light weigh the read noise by more than one.
     more = n * (1 / sums.light**2).sum() / (1 / sums.light).sum() ** 2 - 1
     if not clear.any():

@@ -107,10 +107,10 @@ def with_rows_of(rule: RowRule, summary: Summary) -> RowRule:
     if rule.layout is None:
         pooled = np.concatenate([h.counts.sum((1, 2), dtype=np.float64) for h in histograms])
         return replace(rule, blocks=(replace(rule.blocks[0], counts=pooled[:, None, None, :]),))
-    layouts, counts = zip(*map(sort_rows, histograms), strict=True)
-    whole, ends = np.concatenate(counts), np.cumsum([0, *(b.low.shape[1] for b in rule.blocks)])
-    cuts = zip(rule.blocks, ends, ends[1:], strict=False)
-    blocks = tuple(replace(block, counts=whole[:, start:stop]) for block, start, stop in cuts)
+    layouts, counts = zip(*map(_sort_rows, histograms), strict=True)
+    ends = np.cumsum([block.low.shape[1] for block in rule.blocks])
+    parts = np.split(np.concatenate(counts), ends[:-1], axis=1)  # a block's groups follow those of the one before
+    blocks = tuple(replace(block, counts=of_block) for block, of_block in zip(rule.blocks, parts, strict=True))
     return replace(rule, blocks=blocks, layout=jax.tree.map(lambda *x: np.concatenate(x), *layouts))
 
 
@@ -177,7 +177,7 @@ def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary
     scale = np.clip(1 / (float(model["gain"].value[c]) * np.sqrt(12 * electrons)), 1e-3, 1.0)
     bins = histograms.edges_dn, histograms.outlier_law
     beta, table, information = (np.asarray(x) for x in _scan(at, c, without_counts(summary), *bins, scale))
-    layout, counts = sort_rows(histograms)
+    layout, counts = _sort_rows(histograms)
     low, high, peak = _reach(table, beta, counts)
     # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
@@ -202,7 +202,7 @@ def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary
     return layout, scale, tuple(blocks)
 
 
-def sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
+def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
     """Rows of each exposure in groups of similar mean, and their histograms in that order."""
     exposures, frames, n, bins = histograms.counts.shape
     total = frames * n

@@ -16,7 +16,8 @@ import numpy as np
 
 from hsnoise._core.compiling import jit_lean
 from hsnoise.likelihood.coordinates import Coordinates
-from hsnoise.likelihood.darks import RowRule, Tables, binning, dark_laws, evaluate, evidence, nodes_of, tables_of
+from hsnoise.likelihood.darks import RowRule, Tables, binning, dark_laws, evidence, nodes_of, tables_of
+from hsnoise.likelihood.gradients import likelihood_at
 from hsnoise.likelihood.plan import plan_rules, with_rows_of
 from hsnoise.likelihood.rows import Layout, Nodes
 from hsnoise.likelihood.summary import Summary, without_counts
@@ -67,7 +68,8 @@ class Score:
                 of_tables = _of_tables(kept.nodes, kept.tables, *rows)
                 total += np.asarray(self._through(kept, of_tables))
             if summary.flats is not None:
-                total += np.asarray(_of_flats(self.coordinates, self.centre, replace(summary, histograms=())))
+                lit = replace(summary, histograms=())
+                total += np.asarray(likelihood_at(self.coordinates, self.centre, lit, ())[1])
         return total
 
     def _through(self, kept: _Kept, of_tables: Tables) -> jax.Array:
@@ -138,12 +140,3 @@ def _of_tables(nodes, tables, counts: list[np.ndarray], layout: Layout | None) -
         return jax.grad(evidence)(tables, nodes, counts, layout)
 
     return jax.lax.map(part, jax.tree.map(jnp.asarray, (nodes, tables, counts, layout)))
-
-
-@jit_lean
-def _of_flats(coordinates, at, summary):
-    def value(vector):
-        model, outliers = coordinates.at(vector)
-        return evaluate(model, summary, (), outliers)
-
-    return jax.grad(value)(at)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -191,6 +193,16 @@ def test_bad_files_of_arrays_are_named(tmp_path):
         model_with_arrays().save(path)
     assert np.load(beside)["counts"].shape == (3,)
     beside.write_bytes(whole)
+    stated = json.loads(path.read_text())
+    for wrong in ("model.npz", {"file": 3, "sha256": "0"}, {"file": "model.npz"}):
+        other = tmp_path / "other.json"
+        other.write_text(json.dumps({**stated, "arrays": wrong}))
+        with pytest.raises(ValueError, match=r"other.json: arrays: expected"):
+            NoiseModel.load(other)
+    stated["effects"][-1]["arrays"] = ["row"]
+    other.write_text(json.dumps(stated))
+    with pytest.raises(ValueError, match=r"other.json: "):
+        NoiseModel.load(other)
     path.write_text(path.read_text().replace('"DN^2"', '"DN"'))
     with pytest.raises(ValueError, match=r"measured_spectrum.row: expected unit 'DN\^2', got 'DN'"):
         NoiseModel.load(path)

@@ -24,7 +24,7 @@ from hsnoise.effects import EFFECTS, AbstractEffect, Capture, CaptureFacts, Plac
 from hsnoise.likelihood.parameters import IN_LIKELIHOOD
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
-from hsnoise.statistics.decomposition import COMPONENTS, PlaneSums
+from hsnoise.statistics.decomposition import COMPONENTS, STATIC, PlaneSums
 
 SENSORS, FRAMES, SHAPE = 24, 8, (24, 32)
 GAIN = (1500.0, 1200.0, 1300.0)  # DN/e-: rounding does not matter
@@ -131,6 +131,13 @@ def test_every_effect_that_declares_components_is_drawn():
     declaring = {effect for effect in EFFECTS if effect.components is not AbstractEffect.components}
     assert declaring == {type(effect) for effect in DECLARED}
     assert fx.HotPixels(0.2, 500.0, fano=0.8).components(CAPTURE) == {}
+
+
+@pytest.mark.parametrize("effect", DECLARED, ids=repr)
+def test_what_only_stays_from_frame_to_frame_can_be_measured(effect):
+    """A closed model draws this sensor's map; beside it, a pattern of any sensor would count twice."""
+    if set(effect.components(CAPTURE)) <= set(STATIC):
+        assert effect.measurable
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
