@@ -90,6 +90,16 @@ def test_dim_corners_are_not_dead_and_pixels_that_see_nothing_are(ccd):
     assert (found.reshape(SHAPE) & ~blind).mean() < 0.002
 
 
+def test_what_lies_beside_a_wide_overscan_is_not_dead():
+    """Where most of a run of neighbours sees no light, the others do."""
+    sensor, blind = Ccd(), np.zeros(SHAPE, bool)
+    blind[:, -20:] = True
+    counts = [sensor.frames(4), sensor.frames(4, np.where(blind, 0.0, 3000.0))]
+    found = flags_of(survey(hsnoise.FrameStack(counts, (0.0, 1.0), kind=("dark", "flat"))), 0) & FLAGS["dead"] > 0
+    assert (found.reshape(SHAPE) & ~blind).mean() < 0.002
+    assert found.reshape(SHAPE)[blind].mean() > 0.95
+
+
 @pytest.mark.parametrize(("exponent", "lag"), [(-1.0, 1), (0.5, 1), (2.0, 1), (0.5, 2), (2.0, 2)])
 def test_exponent_of_a_correlation_is_that_of_the_spectrum(exponent, lag):
     n = 128

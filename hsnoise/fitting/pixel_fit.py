@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hsnoise._core.coloured import exponent_of
+from hsnoise._core.coloured import EXPONENTS, exponent_of
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
@@ -56,7 +56,7 @@ class Channel:
             error, and its deviation by chance where there is none.
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
-        row_exponent: of the spectrum of what rows share, with its error; 0 and infinite where they are white.
+        row_exponent: of the spectrum of what rows share, with its error; 0 where they are white.
         warm: share of warm pixels and their mean extra level, DN, with errors, in darks of one exposure; else None.
     """
 
@@ -131,7 +131,10 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
 
 
 def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
-    """Exponent of what rows share in a frame, from the covariance of neighbouring rows of a plane, and its error."""
+    """Exponent of what rows share in a frame, from the covariance of neighbouring rows of a plane, and its error.
+
+    0 for white rows; an infinite error also where rows are redder or bluer than any exponent makes them.
+    """
     planes = _shortest(found, c)
     if not planes:
         return 0.0, np.inf
@@ -143,6 +146,8 @@ def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
     correlation = together.variance_dn2 / alone.variance_dn2
     error = np.hypot(together.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
     low, middle, high = (exponent_of(correlation + way * error, found.shape[0], step) for way in (-1, 0, 1))
+    if middle in EXPONENTS:
+        return middle, np.inf
     return middle, max((high - low) / 2, LEAST_EXPONENT_ERROR)
 
 

@@ -34,7 +34,6 @@ NOMINAL = 50.0  # relative deviation of a gain of which nothing is known
 FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
 THERE = 5.0  # standard errors from which an effect of the population is in the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
-IN_OTHER_UNITS = {"dark_current_nonuniformity", "black_shading"}
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
 OF_PIXELS = (
     DarkCurrentNonuniformity,
@@ -96,8 +95,8 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
 
 
 def in_electrons(number: Number) -> bool:
-    """Whether a parameter has no value without the gain."""
-    return number.place in IN_ELECTRONS or number.effect in set(POPULATION) - IN_OTHER_UNITS
+    """Whether a parameter has no value without the gain: its unit says so."""
+    return "e-" in number.spec.unit
 
 
 def _detail(pixel: PixelFit) -> str:
@@ -136,9 +135,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
-    exponent = _mean([c.row_exponent for c in pixel.channels])
-    if "row_noise" in found and np.isfinite(exponent[1]):
-        found["row_noise"]["exponent"] = exponent
+    exponents = [c.row_exponent for c in pixel.channels]
+    if "row_noise" in found and all(value != 0 for value, _ in exponents):
+        found["row_noise"]["exponent"] = _mean(exponents)
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}

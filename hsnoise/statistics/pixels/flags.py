@@ -60,7 +60,7 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
         return np.zeros(len(signal), bool)
     plane = found.groups[0].of(channel)[0]
     nearby = of_neighbours(signal, len(plane.column_mean_dn))
-    return (signal < DIM * nearby) | (nearby < least)
+    return (signal < DIM * nearby) | ((nearby < least) & (signal < least))
 
 
 def _jumping(halves, pixels: int) -> np.ndarray:
