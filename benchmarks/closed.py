@@ -14,6 +14,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -121,6 +122,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[], metavar="SENSOR", help=", ".join(SENSORS))
     only = parser.parse_args().only
+    if find_spec("sklearn") is None:
+        parser.error('needs scikit-learn: pip install ".[closed]"')
     headings = ("capture", "error", "unexplained, of all", "closed", "normal", "real", "fit and closing")
     sheet = Sheet("Told from held-out frames: area under the curve of closed, normal and real frames", headings)
     for name, place in SENSORS.items():
