@@ -53,6 +53,7 @@ def fitted(capture) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_path, capsys):
     arguments = [str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "loop")]
     assert main(["compare", *arguments, "--model", str(fitted / "model.json"), "--debug"]) == 0
@@ -62,6 +63,7 @@ def test_compare_prints_where_a_model_fails_and_draws_it(capture, fitted, tmp_pa
     assert "--model: made for RGGB" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_fit_fits_the_effects_of_a_model(capture, tmp_path, capsys):
     bare = hsnoise.NoiseModel.load(capture / "true.json").remove("row_gain")
     bare.save(tmp_path / "bare.json")
@@ -152,6 +154,7 @@ def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, mon
     assert "read_noise" in hsnoise.NoiseModel.load(tmp_path / "model.json")
 
 
+@pytest.mark.slow
 def test_demo_takes_data(capture, tmp_path, capsys, short_loop):
     arguments = ["--data", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path / "out")]
     assert main(["demo", *arguments]) == 0

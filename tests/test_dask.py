@@ -123,6 +123,7 @@ def kill_once_read(processes, folder):
         process.kill()
 
 
+@pytest.mark.slow
 def test_fit_of_a_dask_array_is_that_in_memory(counts):
     lazy = da.from_array(counts, chunks=(1, 4, 64, 96))
     one, other = hsnoise.fit(lazy, **CAPTURE), hsnoise.fit(counts, **CAPTURE)

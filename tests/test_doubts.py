@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hsnoise
+from hsnoise._core.conclusion import Light
 from hsnoise.fit import _surveyed
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts.checks import Evidence, checked
@@ -118,3 +119,13 @@ def test_a_gain_that_nothing_tells_is_withheld_by_the_likelihood_too(rng):
     assert np.isnan(fit.table["gain"][0]) and not fit.has_gain and not fit.trustworthy
     assert fit.conclusion.light == "amber" and "The gain is not determined" in fit.conclusion.sentence
     assert "Read noise is 6." in fit.doubts[0]
+
+
+@pytest.mark.parametrize(("exposure_s", "light"), [(0.002, Light.RED), (1.0, Light.AMBER)])
+def test_a_gain_from_one_exposure_is_doubted(exposure_s, light, rng):
+    """Rows of a CCD that have an offset look like rows of another gain; a dark current of 1e5 e-/s is none."""
+    noise = 3.0 * rng.standard_normal((2, 240, 320)) + 0.5 * rng.standard_normal((2, 240, 1))
+    counts = np.clip(np.round(15.0 + noise), 0, None).astype(np.uint16)
+    found = hsnoise.fit(counts, exposure_s=exposure_s, shutter="global", pixels="alike")
+    assert found.has_gain and found.conclusion.light == light
+    assert any("All darks have one exposure" in doubt for doubt in found.doubts)

@@ -108,6 +108,7 @@ def test_singles_of_a_twilight_are_paired_and_a_lone_one_is_set_aside():
     assert all(one.standard_error[0] < 0.02 * GAIN for one in found)
 
 
+@pytest.mark.slow
 def test_flats_of_another_crop_join_the_fit_of_the_darks(rng):
     sensor, elsewhere = Sensor(rng), Sensor(rng, shape=(64, 160))
     flats = FrameStack([elsewhere.frames(e, 4) for e in (300, 3000)], [0.1, 0.2], kind="flat", shutter="global")

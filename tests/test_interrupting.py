@@ -68,7 +68,7 @@ def interrupted(process: subprocess.Popen, twice: bool = False) -> str:
     return err
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+@pytest.mark.parametrize("delay_s", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_while_modules_are_imported(delay_s, darks, tmp_path):
     process = start([*MODULE, "fit", str(darks), "--out", str(tmp_path / "out")])
     wait_for_imports(process)

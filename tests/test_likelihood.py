@@ -140,6 +140,7 @@ def test_gradient_matches_differences(shutter):
         np.testing.assert_allclose((slope * step).sum(), difference, rtol=1e-3, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_jit_vmap_and_a_float32_session_give_the_same():
     model = camera(shutter="rolling", black_level_dn=10.0)
     summary = hsnoise.summarise(capture(model, shape=(16, 32)))

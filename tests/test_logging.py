@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 import hsnoise
 from hsnoise import effects as fx
@@ -47,6 +48,7 @@ def test_a_fit_tells_its_stages_and_prints_nothing(caplog, capfd):
     assert ("hsnoise.fit", str(result)) in said(caplog, logging.DEBUG)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_of_few_draws_tells_what_is_likely_and_what_is_missing(few_candidates, caplog, capfd):
     """With fewer draws than another step used to take, too."""
     ticks = []

@@ -372,6 +372,7 @@ def test_what_is_no_random_key_is_named(name, key):
         sample(keys["key"], np.zeros((1, 4, 4)), canon_5d3(), sensor_key=keys["sensor_key"])
 
 
+@pytest.mark.slow
 def test_draws_within_a_larger_program_are_the_same_and_stay_whole():
     """XLA would compute them anew for each of the colours that are taken from them."""
     camera, light = canon_5d3(), jnp.linspace(0.0, 30.0, 2 * 16 * 24 * 3).reshape(2, 16, 24, 3)

@@ -118,7 +118,7 @@ def test_bins_that_are_put_together_keep_their_pixels():
     assert np.all(np.diff(edges) > 0)
 
 
-@pytest.mark.parametrize("black_level_dn", [0.0, 100.0])
+@pytest.mark.parametrize("black_level_dn", [0.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_photon_transfer_lies_on_the_curve_of_the_fit(black_level_dn):
     fit = fitted(black_level_dn)
     axes = plots.photon_transfer(fit).axes[0]

@@ -82,7 +82,7 @@ def drawn(figure) -> bytes:
     [
         pytest.param((), id="mono"),
         pytest.param(("RGGB",), id="bayer", marks=pytest.mark.slow),
-        pytest.param(("mono", TIMES, True), id="flats"),
+        pytest.param(("mono", TIMES, True), id="flats", marks=pytest.mark.slow),
     ],
 )
 def test_every_figure_of_a_fit_can_be_drawn_and_names_its_axes(options):

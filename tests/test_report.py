@@ -151,7 +151,12 @@ def test_a_page_stands_alone(pages, command):
             marks=pytest.mark.slow,
         ),
         (("row_noise",), 7.2, "Still off with row_noise at the first estimate (the worst group, row x frame, by"),
-        ((), 1.2, "No group of statistics stands out. Single statistics that are off by more than 3"),
+        pytest.param(
+            (),
+            1.2,
+            "No group of statistics stands out. Single statistics that are off by more than 3",
+            marks=pytest.mark.slow,
+        ),
         pytest.param((), 7.2, "Far off (the worst group, row x frame, by 7.2 deviations)", marks=pytest.mark.slow),
     ],
 )
@@ -288,6 +293,7 @@ def test_the_budget_shows_what_a_model_lacks(stack):
     assert list(panels) == [f"{name}, dark of 200 ms, noise budget" for name in ("red", "green", "blue")]
 
 
+@pytest.mark.slow
 def test_a_page_of_a_fit_says_its_doubts(stack, story):
     fit = replace(story.fit, doubts=("One <b>doubt</b>.", "Another."), grave=True)
     text = Elements(report.page(fit, stack)).text
@@ -295,6 +301,7 @@ def test_a_page_of_a_fit_says_its_doubts(stack, story):
     assert "Doubts: One <b>doubt</b>. Another. A note." in text
 
 
+@pytest.mark.slow
 def test_a_page_of_an_unfinished_story_says_so(stack, story, pages):
     so_far = replace(story, steps=story.steps[:1], ending=Ending(Ended.UNFINISHED))
     text = Elements(report.page(so_far, stack)).text
@@ -303,6 +310,7 @@ def test_a_page_of_an_unfinished_story_says_so(stack, story, pages):
     assert "The search was still running" not in Elements(pages["improve"]).text
 
 
+@pytest.mark.slow
 def test_a_page_of_a_large_sensor_is_small():
     rng = np.random.default_rng(3)
     counts = rng.normal(70, 6, (1, 2, 1000, 1500)).round().astype(np.uint16)
@@ -346,6 +354,7 @@ def test_a_wrong_path_is_told_before_long_work(command, path, tmp_path, monkeypa
     assert [one.name for one in tmp_path.iterdir()] == ["folder.html"]
 
 
+@pytest.mark.slow
 def test_the_command_line_writes_it(tmp_path, monkeypatch, compared, capsys):
     MONO.save(tmp_path / "model.json")
     darks = tmp_path / "darks.npz"
@@ -359,7 +368,7 @@ def test_the_command_line_writes_it(tmp_path, monkeypatch, compared, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["comparison.png", "report.html"]
 
 
-@pytest.mark.parametrize("command", ["improve", "demo"])
+@pytest.mark.parametrize("command", [pytest.param("improve", marks=pytest.mark.slow), "demo"])
 def test_a_story_that_is_broken_off_has_its_page(command, tmp_path, monkeypatch, story, capsys):
     MONO.save(tmp_path / "model.json")
     darks, out, pages = tmp_path / "darks.npz", tmp_path / "out", []

@@ -77,6 +77,7 @@ def mixture():
     return model, stack, hsnoise.fit(stack, model=with_share(model, 0.6)), hsnoise.fit(stack)
 
 
+@pytest.mark.slow
 def test_a_free_white_share_is_found(mixture):
     model, _, free, without = mixture
     assert free.converged and free.notes == ()
@@ -95,6 +96,7 @@ def test_a_share_that_is_not_asked_for_changes_nothing(mixture):
     assert held.table["row_gain.white_share"] == (0.0, 0.0, "1")
 
 
+@pytest.mark.slow
 def test_the_likelihood_rises_to_the_fitted_share(mixture):
     """Its gradient by the model's own leaves is 0 at the estimate, and is that of finite differences elsewhere."""
     _, _, free, _ = mixture

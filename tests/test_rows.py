@@ -73,7 +73,12 @@ def dense_log_evidence(y, variance, covariance):
 
 @pytest.mark.parametrize(
     ("sigma", "exponent", "noise", "mean"),
-    [(0.1, 1.0, 0.08, 1.0), (0.1, 0.5, 0.05, 1.0), (0.05, 1.5, 0.02, 1.0), (0.05, 1.0, 0.06, 0.7)],
+    [
+        pytest.param(0.1, 1.0, 0.08, 1.0, marks=pytest.mark.slow),
+        (0.1, 0.5, 0.05, 1.0),
+        (0.05, 1.5, 0.02, 1.0),
+        (0.05, 1.0, 0.06, 0.7),
+    ],
 )
 def test_coloured_rows_match_the_dense_gaussian(sigma, exponent, noise, mean):
     """Gaussian curves of unequal width: the mean is exact, the determinant good to a fraction of a nat.
@@ -100,6 +105,7 @@ def lognormal_curves(nodes, centres, width=0.1):
     return jnp.asarray(-0.5 * (np.log(beta / np.maximum(centres, 0.2)[..., None]) / width) ** 2)
 
 
+@pytest.mark.slow
 def test_coloured_rows_with_a_white_spectrum_are_the_white_rows():
     rng = np.random.default_rng(2)
     sigma = 0.2
@@ -112,6 +118,7 @@ def test_coloured_rows_with_a_white_spectrum_are_the_white_rows():
     np.testing.assert_allclose(total, white.sum(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradient_of_coloured_rows_needs_no_derivative_of_the_iteration():
     rng = np.random.default_rng(3)
     nodes = nodes_over(0.0, 2.5, 0.05, 0.3, 300)

@@ -63,7 +63,15 @@ def exact(found, summary, moved=0.0):
         return np.sum(parts, 0)
 
 
-@pytest.mark.parametrize(("model", "kept"), [(ALIKE, True), (WHITE, True), (WHITE, False), (COLOURED, True)])
+@pytest.mark.parametrize(
+    ("model", "kept"),
+    [
+        (ALIKE, True),
+        pytest.param(WHITE, True, marks=pytest.mark.slow),
+        (WHITE, False),
+        pytest.param(COLOURED, True, marks=pytest.mark.slow),
+    ],
+)
 def test_is_the_gradient_of_the_likelihood(model, kept, monkeypatch):
     """Of the capture that it was made for, and nearly of others; whether or not derivatives of tables are kept."""
     if not kept:

@@ -100,6 +100,7 @@ def test_what_is_no_capture_is_named(call, folder, counts):
         call(stack, metod="ml")
 
 
+@pytest.mark.slow
 def test_results_of_a_path_are_those_of_its_frames(folder, counts):
     keywords = {"exposure_s": EXPOSURE_S, "black_level": 100.0}
     of_path, of_frames = (hsnoise.budget(source, **keywords) for source in (folder, counts))

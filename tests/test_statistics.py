@@ -186,6 +186,7 @@ def any_counts(draw):
 
 
 @given(any_counts(), st.sampled_from(CFAS))
+@pytest.mark.slow
 def test_every_pixel_is_counted_once_whatever_the_range(capture, cfa):
     counts, white_level = capture
     summary = summarise(FrameStack(counts, 0.1, cfa=cfa, white_level=white_level))

@@ -80,6 +80,7 @@ def test_any_size(rows, columns, stride):
     assert net(out, state)[0].shape == frame.shape
 
 
+@pytest.mark.slow
 def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
     frames = video(2, (48, 60), seed=3)[:, 0]
     whole, tiled = (list(enhance(NET, frames, tile=tile, margin=24)) for tile in (None, 16))

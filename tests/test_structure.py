@@ -194,7 +194,9 @@ def test_colours_and_levels_are_those_of_the_planes(rng):
         np.testing.assert_allclose(got, [20.0, 26.0, 50.0], atol=0.15)
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize(
+    "camera", [pytest.param(name, marks=pytest.mark.slow if name == "grasshopper3" else ()) for name in CAMERAS]
+)
 def test_clean_draws_have_no_correlations(camera):
     names, mean, spread = clean(camera)
     words = ("correlation of exposures", "correlation, same", "columns away", "coherence")

@@ -63,6 +63,7 @@ def leaves(path):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(load_network(path)[0])]
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_with_the_same_weights(folder, whole, tmp_path, monkeypatch):
     step, monkeypatch_s = Trainer.step, 0.0
     monkeypatch.setattr(train, "CHECKPOINT_S", monkeypatch_s)
@@ -268,6 +269,7 @@ def test_rivals_make_noisy_frames_better():
         assert after < 0.2 * before, name
 
 
+@pytest.mark.slow
 def test_an_evaluation_is_written(folder, whole, tmp_path, capsys):
     weights = whole / train.ENDED
     run_evaluate([str(weights), "--clips", str(folder), "--crop", "8", "--no-rivals", "--out", str(tmp_path / "found")])
@@ -354,6 +356,7 @@ def test_noise_of_darks_is_told_before_rounding_and_without_cosmic_hits(rng, sig
     assert sensor.dark_sigma_dn == pytest.approx(sigma_dn, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
     base = [{"a": 20.0, "b": 22.0}, {"c": 24.0, "d": 26.0}]
     apart = [{"a": 0.9, "b": 1.3}, {"c": 1.1, "d": 1.5}]

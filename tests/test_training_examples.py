@@ -29,6 +29,7 @@ def test_a_short_clip_is_played_forth_and_back():
     assert {0, 3} == set(batch.min(1)) | set(batch.max(1)) and len(np.unique(batch[:, 0])) == 4
 
 
+@pytest.mark.slow
 def test_validation_takes_clips_of_different_lengths(tmp_path):
     frames = np.random.default_rng(0).integers(0, 256, (9, 16, 16, 3), dtype=np.uint8)
     clips = [Clip("short", frames[:4]), Clip("long", frames)]
@@ -36,6 +37,7 @@ def test_validation_takes_clips_of_different_lengths(tmp_path):
     assert validation.clean.shape == validation.noisy.shape == (4, 2, 16, 16, 3)
 
 
+@pytest.mark.slow
 def test_examples_have_the_light_of_the_clip_as_their_mean():
     camera = camera_of("grasshopper3", None, (30.0, 30.0))
     model = camera.model.with_value("black_level", "value", 200.0)

@@ -217,8 +217,12 @@ def _trend(values: np.ndarray) -> float:
     return slope * (len(values) - 1) if abs(slope) > WARMING_SIGMA * error else 0.0
 
 
+def is_extraordinary(result: FitResult) -> bool:
+    """Whether the dark current is larger than that of any sensor in the dark."""
+    return bool(result.table.get("dark_current.rate", (0.0,))[0] >= LIGHT_E_PER_S)
+
+
 def _light_note(result: FitResult) -> list[str]:
-    rate = result.table.get("dark_current.rate", (0.0,))[0]
     exposures = result.summary.exposure_s
     if not len(exposures):
         return []
@@ -233,8 +237,9 @@ def _light_note(result: FitResult) -> list[str]:
             f"The frames have a mean of {levels.min():.4g} DN even at {exposures.min():g} s and are hardly brighter at"
             f" {exposures.max():g} s: if they saw light, they are flats; pass {setting('kind', 'flat')}."
         ]
-    if not rate >= LIGHT_E_PER_S:
+    if not is_extraordinary(result):
         return []
+    rate = result.table["dark_current.rate"][0]
     return [
         f"A dark current of {rate:.3g} e-/s would be extraordinary: if these frames saw light, they are flats;"
         f" pass {setting('kind', 'flat')}."

@@ -17,7 +17,7 @@ from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.flat_notes import gain_notes
-from hsnoise.fitting.notes import order_note, pixel_notes
+from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import in_electrons
 from hsnoise.fitting.result import FitResult, Method
@@ -45,7 +45,10 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
     share = _outlier_share(result)
+    alone = list(_by_shape_alone(result))
+    grave += alone if is_extraordinary(result) else []
     minor = (
+        *alone,
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found),
@@ -161,6 +164,19 @@ def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
         yield (
             "Each exposure has one dark frame, so differences between pixels cannot be distinguished from noise; they"
             " can make gain and read noise wrong by large factors. Take two frames of each exposure, better eight."
+        )
+
+
+def _by_shape_alone(result: FitResult) -> Iterator[str]:
+    """A gain from the likelihood of one exposure: no growth of the signal supports it."""
+    summary = result.summary
+    if result.method != Method.ML or not result.has_gain or summary.flats is not None:
+        return
+    if np.unique(summary.exposure_s).size == 1:
+        yield (
+            "All darks have one exposure, so that the gain rests on the shape of their distribution and on how rows"
+            " differ, and other skewed noise or row noise would change it as well. Confirm it by a pair of flats, or"
+            " darks of a second exposure."
         )
 
 
