@@ -206,3 +206,21 @@ def test_hot_pixels_are_measured_from_the_ordinary_ones_when_the_pedestal_falls(
     truth = float(hot[hot > 0].mean())
     assert abs(value - truth) < 4 * np.hypot(error, 0.1 * truth) and error < 0.5 * truth
     assert abs(share - fraction) < 4 * chance
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_read_noise_that_differs_is_in_the_model(spread, rng):
+    """From two exposures of each pixel; pixels without it get none."""
+    shape, exposures = (200, 300), (0.01, 0.1, 1.0)
+    offsets = 8.0 * rng.standard_normal(shape)
+    sigma = 5.0 * np.exp(spread * rng.standard_normal(shape) - spread**2)
+    dark = 100.0 * np.exp(0.5 * rng.standard_normal(shape))
+    darks = [
+        100 + offsets + 2.0 * rng.poisson(dark * t, (6, *shape)) + sigma * rng.standard_normal((6, *shape))
+        for t in exposures
+    ]
+    found = hsnoise.fit(np.round(darks).clip(0, 4095).astype(np.uint16), exposure_s=exposures, pixels="differ")
+    assert ("read_noise_nonuniformity" in found.params) is (spread > 0)
+    if spread:
+        # Shot noise and pixels that are left out as outliers make it a little small.
+        assert found.table["read_noise_nonuniformity.spread"][0] == pytest.approx(spread, rel=0.2)

@@ -46,7 +46,8 @@ def is_there(effect: AbstractEffect, result: FitResult) -> bool:
         [p for p in found if p.spec.low == 0],
     )
     amplitudes = next((some for some in kinds if some), [])
-    fitted = [p.spec.from_absent(*result.table[p.name][:2]) for p in amplitudes if p.name in result.names]
+    rows = result.in_dn(effect.name)
+    fitted = [p.spec.from_absent(*rows[p.name][:2]) for p in amplitudes if p.name in result.names]
     if not fitted:
         return not amplitudes or any(p.spec.from_absent(p.value)[0] != 0 for p in amplitudes)
     return any(abs(off) > rules.THERE_SIGMA * error for off, error in fitted)

@@ -35,7 +35,7 @@ from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import Step, Story
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import fit, rechecked
-from hsnoise.fitting.result import FitResult, Method, number
+from hsnoise.fitting.result import FitResult, Method, Status, number
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
@@ -121,7 +121,7 @@ def improved(
     _check_start(model, candidates, portion, seed)
     limit = Limit.of(max_minutes, max_steps)
     unseen = None if held_out is None else Portion.of(held_out)
-    work, split = _Work(fitted, portion, unseen, seed, tell, limit), split_in_words(fitted, held_out)
+    work, split = _Work(fitted, portion, unseen, seed, tell, limit, model is not None), split_in_words(fitted, held_out)
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
@@ -155,7 +155,8 @@ def improved(
 class _Work:
     """What every step is made of.
 
-    fitted: frames to fit, and the portion of them that is drawn; held_out: frames that no fit sees; tell: gets events.
+    fitted: frames to fit, and the portion of them that is drawn; held_out: frames that no fit sees; tell: gets events;
+    given: whether the user chose the effects of the first model.
     """
 
     fitted: FrameStack
@@ -164,6 +165,7 @@ class _Work:
     seed: int
     tell: Callable[[Event], Any]
     limit: Limit = NO_LIMIT
+    given: bool = False
 
     def say(self, event: Event) -> None:
         """Report a stage, and log it."""
@@ -179,6 +181,9 @@ class _Work:
         tick = self.counter(_stage("looking for what is missing", steps))
         found = diagnosed(last.fit, self.portion, tuple(own), seed=self.seed, tick=tick)
         steps[-1] = last = replace(last, diagnosis=found)
+        if found.verdict == Verdict.UNEXPLAINED and (other := self.pixels_followed(steps)) is not None:
+            steps[:] = other
+            return None
         nearest = _nearest(found)
         if not nearest:
             return _ending(found, last.comparison)
@@ -216,6 +221,32 @@ class _Work:
             self.say(_stage(f"adding {name}, as measured", steps))
             steps.append(self.step(first.without(first.added[i + 1 :]), name, steps))
         return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
+
+    def pixels_followed(self, steps: Sequence[Step]) -> list[Step] | None:
+        """The story begun anew by a fit that follows each pixel, if that comes much nearer than pooled pixels.
+
+        It measures what frames, rows and columns share, all at once, which no single effect explains. A gain that
+        nothing casts doubt on is not given up for it.
+        """
+        pooled = steps[-1].fit
+        if len(steps) > 1 or self.given or pooled.method not in (Method.ML, Method.LINE):
+            return None
+        stage = _stage("following each pixel over time", steps)
+        self.say(stage)
+        try:
+            result = fit(self.fitted, pixels="differ")
+        except (RuntimeError, ValueError) as error:
+            self.say(Event(f"pixels cannot be followed here: {error}"))
+            return None
+        if not result.added or (pooled.has_gain and not result.has_gain and pooled.trustworthy):
+            return None
+        before = steps[-1].comparison.error
+        status = replace(result, status=Status.NEARER, detail=number(before))
+        begun = self.begun(status)
+        if begun[-1].comparison.error > rules.HALF * before:
+            self.say(Event(f"pixels stay pooled: following them leaves an error of {begun[-1].comparison.error:.2f}"))
+            return None
+        return begun
 
     def first_that_holds(
         self, candidates: Sequence[Candidate], steps: list[Step]

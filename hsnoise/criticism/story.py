@@ -52,7 +52,7 @@ class Step:
         if self.added is None:
             return ()
         effect = self.fit.params[self.added]
-        return sentences.sizes(self.fit.rows_of(self.added), effect, self.ahead < rules.SIDES_APART)
+        return sentences.sizes(self.fit.in_dn(self.added), effect, self.ahead < rules.SIDES_APART)
 
 
 @dataclass(frozen=True)

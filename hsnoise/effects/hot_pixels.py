@@ -13,15 +13,17 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
-PAIRS = 1  # what sets the random key of electrons that come in pairs apart
+PAIRS, KINDS = 1, 2  # what sets the random keys of electrons that come in pairs, and of kinds of defects, apart
 
 
 class HotPixels(AbstractEffect):
     """Extra dark electrons, Poisson(rate_i * exposure + at_readout_i), in a fraction of the pixels, always the same.
 
     Defects of the silicon, many by radiation, generate charge. Every pixel is hot with probability `fraction`,
-    independently; the rates of hot pixels are exponentially distributed with mean `rate`. They generate charge also
-    while a frame waits to be read, for the same time in each frame: `at_readout` is proportional to the rate.
+    independently; the rates of hot pixels are exponentially distributed with mean `rate`, or, as defects differ in
+    energy and field, exponential about means that are log-normal: `spread` is the standard deviation of their
+    logarithm, and a few pixels are then hundreds of times as hot as most. They generate charge also while a frame waits
+    to be read, for the same time in each frame: `at_readout` is proportional to the rate.
 
     A single generation centre emits a hole, then an electron: if both steps take equally long, every second arrival of
     a Poisson process is an electron, and the variance of many is half of their mean. `fano` is that ratio for large
@@ -49,12 +51,17 @@ class HotPixels(AbstractEffect):
         doc="mean extra electrons of a hot pixel whatever the exposure",
     )
     fano: Scalar = param("1", low=0.5, high=1, default=1.0, held="at bounds", doc="variance over mean of hot charge")
+    spread: Scalar = param(
+        "1", low=0, default=0.0, held="at bounds", doc="standard deviation of ln of hot pixels' mean rates"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(capture.fixed_key(self.name))
         shape = (1, *signal.shape[1:])
         hot = jax.random.uniform(where, shape, signal.dtype) < self.fraction
         strength = jax.random.exponential(how_much, shape, signal.dtype)
+        kind = jax.random.normal(jax.random.fold_in(how_much, KINDS), shape, signal.dtype)
+        strength = strength * jnp.exp(self.spread * kind - self.spread**2 / 2)
         mean = jnp.where(hot, strength * (self.rate * capture.exposure_s + self.at_readout), 0)
         in_pairs = 2 * (1 - self.fano)
         single = draw_poisson(key, (1 - in_pairs) * mean, signal.shape)
@@ -85,7 +92,8 @@ class HotPixels(AbstractEffect):
             return {}
         mean = float(self.rate * capture.exposure_s + self.at_readout)
         # Exponential charges have twice the square of their mean as their mean square.
-        static = float(self.fraction * (2 - self.fraction)) * mean**2
+        square = 2 * np.exp(float(self.spread) ** 2)
+        static = float(self.fraction) * (square - float(self.fraction)) * mean**2
         return {
             "pixel": capture.offset_variance(static),
             "temporal": capture.offset_variance(float(self.fraction) * mean),

@@ -19,10 +19,10 @@ from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
-from hsnoise.statistics.pixels.population import Population, offset_sigma, population_of, warm_of
+from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading, shading_of
-from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
+from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows, read_noise_spread
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
@@ -57,7 +57,8 @@ class Channel:
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_exponent: of the spectrum of what rows share, with its error; 0 where they are white.
-        warm: share of warm pixels and their mean extra level, DN, with errors, in darks of one exposure; else None.
+        noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
+        warm: the warm pixels in darks of one exposure; else None.
     """
 
     name: str
@@ -72,7 +73,8 @@ class Channel:
     temporal_dn2: float
     shading: Mapping[str, Shading]
     row_exponent: tuple[float, float]
-    warm: tuple[tuple[float, float], tuple[float, float]] | None
+    noise_spread: tuple[float, float]
+    warm: Warm | None
 
 
 @dataclass(frozen=True)
@@ -124,10 +126,11 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     if warm is not None:  # many warm pixels move the median of all: what is not theirs is black
-        (share, _), (extra, _) = warm
+        share, extra = warm.fraction[0], warm.extra_dn[0]
         black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
+    noise_spread = read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf)
     of_rows = patterns, floor, shading, _row_exponent(found, c)
-    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, warm)
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, noise_spread, warm)
 
 
 def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
@@ -151,7 +154,7 @@ def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
     return middle, max((high - low) / 2, LEAST_EXPONENT_ERROR)
 
 
-def _warm(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def _warm(found: Survey, c: int) -> Warm | None:
     planes = _shortest(found, c)
     if not planes:
         return None

@@ -18,13 +18,14 @@ from hsnoise.effects import (
     DarkSignalNonuniformity,
     FrameOffset,
     HotPixels,
+    ReadNoiseNonuniformity,
     RowFixedPattern,
     RowNoise,
 )
 from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
-from hsnoise.likelihood.parameters import Number, numbers_of
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.shading import Shading
@@ -39,6 +40,7 @@ OF_PIXELS = (
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     HotPixels,
+    ReadNoiseNonuniformity,
     FrameOffset,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -47,6 +49,7 @@ OF_PIXELS = (
     BlackShading,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
+LEAST_NOISE_SPREAD = 0.1  # smaller ones hardly show, and hits and jumps that were not left out look alike
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # deviations by chance, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
@@ -71,7 +74,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     names, covariance = _covariance(pixel, params, population, black[1], row[1])
     errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
     numbers = numbers_of(params)
-    withheld = () if pixel.determined else tuple(number.name for number in numbers if in_electrons(number))
+    withheld = () if pixel.determined else tuple(number.name for number in numbers if number.is_in_electrons)
     unknown = [n.name for n in numbers if n.place == ("row_gain", "sigma") and errors.get(n.name, 0.0) > 1]
     if np.ptp(summary.exposure_s) == 0 and "dark_current" in params:
         unknown.append("dark_current.rate")
@@ -92,11 +95,6 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         transfer=pixel,
         stack=stack,
     )
-
-
-def in_electrons(number: Number) -> bool:
-    """Whether a parameter has no value without the gain: its unit says so."""
-    return "e-" in number.spec.unit
 
 
 def _detail(pixel: PixelFit) -> str:
@@ -141,6 +139,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
+    noise_spread = _mean([c.noise_spread for c in pixel.channels])
+    if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
+        found["read_noise_nonuniformity"] = {"spread": noise_spread}
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
         return found | _warm(pixel, gain, longest_s)
@@ -152,6 +153,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in many]),
         "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in many]),
     }
+    tail = _mean([p.hot_spread for p, _ in many])
+    if tail[0] > 0:
+        hot["spread"] = tail
     fano = _fano(pixel)
     if fano is not None:
         hot["fano"] = fano
@@ -167,11 +171,13 @@ def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict
     many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
     if not many:
         return {}
-    fraction = _mean([warm[0] for warm, _ in many])
-    charge = _mean([(warm[1][0] / g, warm[1][1] / g) for warm, g in many])
+    fraction = _mean([warm.fraction for warm, _ in many])
+    charge = _mean([(warm.extra_dn[0] / g, warm.extra_dn[1] / g) for warm, g in many])
+    tail = _mean([warm.spread for warm, _ in many])
+    hot = {"fraction": fraction} | ({"spread": tail} if tail[0] > 0 else {})
     if longest_s > 0:
-        return {"hot_pixels": {"fraction": fraction, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
-    return {"hot_pixels": {"fraction": fraction, "rate": (0.0, np.inf), "at_readout": charge}}
+        return {"hot_pixels": {**hot, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
+    return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}
 
 
 def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:

@@ -46,6 +46,7 @@ class Status(StrEnum):
     TRANSFER = "pixel transfer"
     TRANSFER_INSTEAD = "pixel transfer instead"  # of a likelihood that did not converge
     CONTRADICTED = "likelihood contradicted"  # by pixels over time: pixel transfer instead
+    NEARER = "pixel transfer nearer"  # than a likelihood of pooled pixels
     MET = "statistics met"  # by simulated ones
     NOT_MET = "statistics not met"
 
@@ -64,6 +65,7 @@ OUTCOMES = {
     Status.TRANSFER: "{}",
     Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer used instead",
     Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer used instead",
+    Status.NEARER: "each pixel over time, because pooled pixels leave an error of {}",
     Status.MET: "simulated statistics met: {}",
     Status.NOT_MET: "NOT CONVERGED: simulated statistics not met: {}",
 }
@@ -161,20 +163,35 @@ class FitResult:
     def table(self) -> dict[str, tuple[float, float, str]]:
         """Parameter name to (value, standard error, unit); the error is 0 for a value that was held, not fitted,
         and infinite where the capture says nothing."""
+        rows_ = self._rows
+        return rows_ | {name: (float("nan"), float("inf"), rows_[name][2]) for name in self.withheld if name in rows_}
+
+    @property
+    def _rows(self) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table`, nothing withheld."""
         fitted = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)), strict=True))
-        rows_ = {}
-        for name, (value, _, unit) in self.params.table.items():
-            if name in self.withheld:
-                rows_[name] = (float("nan"), float("inf"), unit)
-                continue
-            error = float(fitted.get(name, np.inf if name == "dark_current.rate" else 0.0))
-            rows_[name] = (value, error, unit)
-        return rows_
+        held = {"dark_current.rate": float("inf")}
+        return {
+            name: (value, float(fitted.get(name, held.get(name, 0.0))), unit)
+            for name, (value, _, unit) in self.params.table.items()
+        }
 
     def rows_of(self, effect: str) -> dict[str, tuple[float, float, str]]:
         """The rows of `table` that are one effect's. Raises KeyError if the model has none of that name."""
         table = self.table
         return {one.name: table[one.name] for one in self.params[effect].parameters(self.params.channels)}
+
+    def in_dn(self, effect: str) -> dict[str, tuple[float, float, str]]:
+        """`rows_of`, but electrons as DN where the gain is unknown: `params` then has a gain of 1 DN/e-.
+
+        Raises KeyError if the model has no such effect.
+        """
+        rows_ = self._rows
+        names = [one.name for one in self.params[effect].parameters(self.params.channels)]
+        return {
+            name: (*rows_[name][:2], rows_[name][2].replace("e-", "DN") if name in self.withheld else rows_[name][2])
+            for name in names
+        }
 
     @property
     def outcome(self) -> str:

@@ -209,11 +209,15 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
     with jax.enable_x64(True):
         turn[range(n, len(y)), range(n, len(y))] = np.asarray(problem.added.slope(jnp.asarray(y[n:])))
     of_base = "" if base.method == Method.ML else f"; of the fit that it starts from: {base.outcome}"
+    withheld = base.withheld
+    if not base.has_gain:
+        withheld = (*withheld, *(number.name for number in problem.added.numbers if number.is_in_electrons))
     result = replace(
         base,
         params=problem.in_float64(y),
         outliers=None,
         names=(*base.names, *problem.added.names),
+        withheld=withheld,
         covariance=not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
         method=Method.SYNTHETIC,
         status=Status.MET if last_step < LONG_STEP else Status.NOT_MET,
@@ -247,7 +251,7 @@ def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[
     for name, sigma in zip(problem.added.names, deviation, strict=True):
         if sigma <= 0.7 * PRIOR_SIGMA:
             continue
-        value, error, unit = result.table[name]
+        value, error, unit = result.in_dn(name.partition(".")[0])[name]
         if value < 2 * error:
             told.append(f"{near_zero(name, value, error, unit_in_words(unit))}.")
         else:

@@ -66,6 +66,11 @@ class Number:
         """Whether it belongs to no effect."""
         return self.effect == OUTLIERS
 
+    @property
+    def is_in_electrons(self) -> bool:
+        """Whether it has no value without the gain: its unit says so."""
+        return "e-" in self.spec.unit
+
     def value_in(self, model: NoiseModel) -> float:
         """Its value in a model."""
         return float(np.asarray(getattr(model[self.effect], self.field))[self.index])

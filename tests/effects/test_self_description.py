@@ -220,7 +220,7 @@ def test_an_effect_is_there_if_it_is_far_from_absent(effect, error, there):
     (name,) = effect.specs()
     value = float(getattr(effect, name))
     rows = {} if error is None else {f"{effect.name}.{name}": (value, error, "1")}
-    result = SimpleNamespace(params=hsnoise.cameras.grasshopper3(), names=tuple(rows), table=rows)
+    result = SimpleNamespace(params=hsnoise.cameras.grasshopper3(), names=tuple(rows), in_dn=lambda _: rows)
     assert is_there(effect, result) is there
 
 

@@ -19,7 +19,6 @@ from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.flat_notes import gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
-from hsnoise.fitting.pixel_result import in_electrons
 from hsnoise.fitting.result import FitResult, Method
 from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
@@ -70,7 +69,7 @@ def _without_open_gain(result: FitResult) -> FitResult:
     gains = list(result.rows_of("gain").values())
     if result.transfer is not None or not result.has_gain or all(error < OPEN * value for value, error, _ in gains):
         return result
-    names = tuple(number.name for number in numbers_of(result.params) if in_electrons(number))
+    names = tuple(number.name for number in numbers_of(result.params) if number.is_in_electrons)
     return replace(result, withheld=tuple(dict.fromkeys((*result.withheld, *names))))
 
 

@@ -1,14 +1,15 @@
 """How pixels differ: the distributions of dark current and offsets over pixels, without the noise of estimation.
 
 Dark current is modelled like the effects that draw it: log-normal (`dark_current_nonuniformity`), with an exponential
-extra in a fraction of pixels (`hot_pixels`). It is fitted to the measured growth of all pixels by maximum likelihood,
-with the known noise of a pixel's growth as part of the distribution. Offsets are normal; their variance is the
-covariance of two halves of the frames, which noise does not enter.
+extra in a fraction of pixels (`hot_pixels`), whose mean may be log-normal as well. It is fitted to the measured growth
+of all pixels by maximum likelihood, with the known noise of a pixel's growth as part of the distribution. Offsets are
+normal; their variance is the covariance of two halves of the frames, which noise does not enter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -18,6 +19,8 @@ from hsnoise._core.quadrature import normal_nodes
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
 from hsnoise.statistics.pixels.sample import of_neighbours
 
+FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
+TAIL_NODES, MOST_TAIL = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
@@ -38,7 +41,7 @@ class Population:
         mean: of ordinary pixels, independent of the limit above which pixels are called hot.
         spread: of ln dark current of ordinary pixels (0: they do not differ).
         hot_fraction, hot_rate: share of hot pixels (0: none), and mean of their extra dark current, such that
-            the mean over all pixels is the measured one.
+            the mean over all pixels is the measured one; hot_spread: of ln mean over hot pixels (0: exponential).
         at_readout: mean extra charge of hot pixels that is independent of exposure, DN.
         offset_sigma: standard deviation of offsets over pixels, without those of rows and columns.
         median, quantiles: of the measured growth, DN/s; quantiles at 1, 16, 84, 99, 99.9 %.
@@ -49,6 +52,7 @@ class Population:
     spread: tuple[float, float]
     hot_fraction: tuple[float, float]
     hot_rate: tuple[float, float]
+    hot_spread: tuple[float, float]
     at_readout: tuple[float, float]
     offset_sigma: tuple[float, float]
     median: float
@@ -80,7 +84,7 @@ def population_of(
     values, errors = _fitted(growth - fallen, noise)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[2:], errors[2:] = 0.0, np.inf
-    body, spread, fraction, rate = values
+    body, spread, fraction, rate, tail = values
     # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
     cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
     beyond = body - cut if spread > 0 or fraction > 0 else 0.0
@@ -96,6 +100,7 @@ def population_of(
         spread=(spread, errors[1]),
         hot_fraction=(fraction, errors[2]),
         hot_rate=(rate, errors[3]),
+        hot_spread=(tail, errors[4]),
         at_readout=_at_readout(pixels, halves, noise, rate),
         offset_sigma=offset_sigma(pattern, spread * body * shortest, low_side_dn),
         median=float(np.median(growth)),
@@ -104,8 +109,16 @@ def population_of(
     )
 
 
-def warm_of(halves: np.ndarray, columns: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Share of warm pixels and their mean extra level in one exposure, DN, with errors; None where there are none.
+class Warm(NamedTuple):
+    """Warm pixels of one exposure, each value with its error: their share, and mean and spread of their extra level."""
+
+    fraction: tuple[float, float]
+    extra_dn: tuple[float, float]
+    spread: tuple[float, float]
+
+
+def warm_of(halves: np.ndarray, columns: int) -> Warm | None:
+    """The warm pixels of one exposure; None where there are none.
 
     halves [half, pixel]: levels of pixels of rows of so many columns. What neighbours share, shading as well, is no
     extra. Without a second exposure nothing tells charge of the exposure from charge of the readout.
@@ -118,7 +131,7 @@ def warm_of(halves: np.ndarray, columns: int) -> tuple[tuple[float, float], tupl
     values, errors = _fitted(extra, noise)
     if values[2] <= 0:
         return None
-    return (float(values[2]), float(errors[2])), (float(values[3]), float(errors[3]))
+    return Warm(*((float(values[i]), float(errors[i])) for i in (2, 3, 4)))
 
 
 def _hot_again(halves: np.ndarray, limit: float) -> bool:
@@ -134,8 +147,13 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
     return float(limit - np.trapezoid(cdf, x) / max(cdf[-1], 1e-12))
 
 
-def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float) -> np.ndarray:
-    """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise."""
+def growth_cdf(
+    x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float, tail: float = 0.0
+) -> np.ndarray:
+    """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise.
+
+    tail: standard deviation of ln of the exponential's mean over pixels.
+    """
     z, weight = normal_nodes(NODES)
     body = mean * np.exp(spread * z - spread**2 / 2)
     off = (x[:, None] - body) / noise
@@ -144,13 +162,19 @@ def growth_cdf(x: np.ndarray, noise: float, mean: float, spread: float, fraction
     else:  # narrow noise would leave steps between the nodes of the log-normal distribution
         left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
         plain = ndtr(np.log(left) / spread + spread / 2) @ weight
-    if fraction > 0:
+    if fraction > 0 and tail > 0:  # beside so wide an extra, what is ordinary in hot pixels counts as normal
+        width = np.hypot(noise, spread * mean)
+        z, weight = normal_nodes(TAIL_NODES)
+        off = (x[:, None] - mean) / width
+        warm = (ndtr(off) - _exponential_share(off, width / (rate * np.exp(tail * z - tail**2 / 2)))) @ weight
+        plain = (1 - fraction) * plain + fraction * warm
+    elif fraction > 0:
         warm = (ndtr(off) - _exponential_share(off, noise / rate)) @ weight
         plain = (1 - fraction) * plain + fraction * warm
     return plain
 
 
-def _exponential_share(off: np.ndarray, ratio: float) -> np.ndarray:
+def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
     """How much an exponential extra of mean noise / `ratio` lowers the normal distribution function at `off`."""
     # exp(ratio^2 / 2 - ratio off) ndtr(off - ratio), without overflow.
     inner = (ratio - off) / np.sqrt(2)
@@ -159,16 +183,16 @@ def _exponential_share(off: np.ndarray, ratio: float) -> np.ndarray:
 
 
 def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """(mean, spread, fraction, rate) of the growth [pixel], and standard errors; zeros for what is not significant."""
+    """(mean, spread, fraction, rate, tail) of the growth [pixel], and errors; zeros for what is not significant."""
     middle = float(np.median(growth))
     core = 1.4826 * float(np.median(np.abs(growth - middle)))
     if core <= 0:
-        return np.array([max(middle, 0.0), 0.0, 0.0, 0.0]), np.full(4, np.inf)
+        return np.array([max(middle, 0.0), 0.0, 0.0, 0.0, 0.0]), np.full(5, np.inf)
     far = max(growth.max() - middle, 12 * core)
     edges = middle + np.append(np.linspace(-6 * core, 6 * core, CORE_BINS), np.geomspace(6.2 * core, far, TAIL_BINS))
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
-    def natural(theta: np.ndarray) -> tuple[float, float, float, float]:
+    def natural(theta: np.ndarray) -> tuple[float, ...]:
         if middle <= 0:  # ordinary pixels have no dark current that could differ
             theta = np.array([0.0, np.log(1e-3), *theta[2:]])
         return _natural(theta, core)
@@ -183,11 +207,14 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     theta = np.array([middle / core, np.log(0.2), np.log(share / (MOST_HOT - share)), np.log(rate / core)])
     for _ in range(2):
         theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
+    if len(excess) >= FEWEST_IN_TAIL:
+        theta = _with_tail(loss, theta)
     values = np.array(natural(theta))
-    units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3]])
-    errors = _errors(loss, theta) * units
+    units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3], values[4]])
+    errors = np.append(_errors(loss, theta), np.full(5 - len(theta), np.inf)) * np.where(units > 0, units, 1.0)
     alike, cool = theta.copy(), theta.copy()
     alike[1], cool[2] = np.log(1e-3), -25.0
+    cool = cool[:4]
     if values[1] < LEAST_SPREAD or 2 * (_refit(loss, alike, 1) - loss(theta)) < SIGNIFICANT:
         values[1], errors[1] = 0.0, max(values[1], errors[1])
     if len(excess) < 10 or 2 * (_refit(loss, cool, 2) - loss(theta)) < SIGNIFICANT:
@@ -195,11 +222,20 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     return values, errors
 
 
-def _natural(theta: np.ndarray, core: float) -> tuple[float, float, float, float]:
-    """Mean, spread, fraction and rate from unconstrained numbers in units of the core's width."""
+def _with_tail(loss, theta: np.ndarray) -> np.ndarray:
+    """The numbers with a tail heavier than exponential, if that is significant, else as they are."""
+    start = np.append(theta, np.log(0.5))
+    for _ in range(2):
+        start = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
+    return start if 2 * (loss(theta) - loss(start)) > SIGNIFICANT else theta
+
+
+def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
+    """Mean, spread, fraction, rate and tail from unconstrained numbers in units of the core's width."""
     fraction = MOST_HOT / (1 + np.exp(-np.clip(theta[2], -40, 40)))
     rate = core * float(np.exp(np.clip(theta[3], -12, 12)))
-    return core * max(float(theta[0]), 1e-3), float(np.exp(np.clip(theta[1], -12, 1.2))), float(fraction), rate
+    tail = float(np.exp(np.clip(theta[4], -4, MOST_TAIL))) if len(theta) > 4 else 0.0
+    return core * max(float(theta[0]), 1e-3), float(np.exp(np.clip(theta[1], -12, 1.2))), float(fraction), rate, tail
 
 
 def _refit(loss, theta: np.ndarray, held: int) -> float:

@@ -61,8 +61,13 @@ def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
 
 def without_outliers(variance: np.ndarray, n_frames: int) -> np.ndarray:
     """Temporal variances [pixel] over so many frames, without outliers."""
+    return variance[is_no_outlier(variance, n_frames)]
+
+
+def is_no_outlier(variance: np.ndarray, n_frames: int) -> np.ndarray:
+    """Which temporal variances over so many frames are typical, or above that by chance [pixel]."""
     typical = float(np.median(variance)) + 1e-6
-    return variance[variance < typical * (1 + OUTLYING * np.sqrt(2 / (n_frames - 1))) ** 2]
+    return variance < typical * (1 + OUTLYING * np.sqrt(2 / (n_frames - 1))) ** 2
 
 
 def halves_of(counts: np.ndarray) -> Halves:
