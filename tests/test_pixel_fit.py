@@ -224,3 +224,21 @@ def test_read_noise_that_differs_is_in_the_model(spread, rng):
     if spread:
         # Shot noise and pixels that are left out as outliers make it a little small.
         assert found.table["read_noise_nonuniformity.spread"][0] == pytest.approx(spread, rel=0.2)
+
+
+def test_flats_give_the_response_of_each_pixel(rng):
+    """Beside offsets of the pixels, and light that falls off towards the corners."""
+    shape, gain, light = (160, 240), 2.0, (2000.0, 8000.0)
+    response = 1 + 0.01 * rng.standard_normal(shape)
+    offsets = 8.0 * rng.standard_normal(shape)
+    row, column = (np.linspace(-1, 1, size) for size in shape)
+    fall = 1 - 0.2 * (row[:, None] ** 2 + column**2)
+
+    def taken(light_e):
+        electrons = rng.poisson(light_e * fall * response, (6, *shape)) + 4.0 * rng.standard_normal((6, *shape))
+        return np.round(400 + offsets + gain * electrons).clip(0, 65535).astype(np.uint16)
+
+    frames = [taken(0.0), *(taken(level) for level in light)]
+    found = hsnoise.fit(frames, exposure_s=[0.01] * 3, kind=["dark", "flat", "flat"], shutter="global", pixels="differ")
+    value, error, _ = found.table["photo_response_nonuniformity.sigma"]
+    assert value == pytest.approx(0.01, rel=0.05) and error < 1e-4

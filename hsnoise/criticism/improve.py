@@ -128,9 +128,11 @@ def improved(
     first = fit(fitted, model=model)
     if not first.has_gain:
         work = replace(work, portion=portion.without_flats("the gain is not determined, and flats need it"))
-    steps = replace(work, limit=NO_LIMIT).begun(first)
-    measured = len(steps)
-    while (ending := limit.reached(len(steps) - measured)) is None:
+    unlimited = replace(work, limit=NO_LIMIT)
+    steps = unlimited.begun(first)
+    if not first.has_gain:
+        steps = unlimited.pixels_followed(steps) or steps
+    while (ending := limit.reached(sum(step.diagnosis is not None for step in steps[:-1]))) is None:
         keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split))
         own = [c for c in candidates if c.name not in steps[-1].fit.params]
         try:
@@ -243,7 +245,8 @@ class _Work:
         before = steps[-1].comparison.error
         status = replace(result, status=Status.NEARER, detail=number(before))
         begun = self.begun(status)
-        if begun[-1].comparison.error > rules.HALF * before:
+        # Without a gain, pooled pixels leave the size of every effect in e- open.
+        if begun[-1].comparison.error > (rules.HALF if pooled.has_gain else 1.0) * before:
             self.say(Event(f"pixels stay pooled: following them leaves an error of {begun[-1].comparison.error:.2f}"))
             return None
         return begun

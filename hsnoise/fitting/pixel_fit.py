@@ -39,6 +39,7 @@ ROW_GAIN_THERE = 3.0
 TOGETHER = 6.0  # deviations by chance from which rows are not white
 LEAST_EXPONENT_ERROR = 0.01  # no spectrum is a power law
 ROUNDS = 30
+MOST_SATURATED = 1e-3  # share of the pixels of a flat
 UNKNOWN = 1e6  # relative error of what is not known
 
 
@@ -58,6 +59,7 @@ class Channel:
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_exponent: of the spectrum of what rows share, with its error; 0 where they are white.
         noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
+        photo_response: standard deviation over pixels of the response to light, relative, with its error.
         warm: the warm pixels in darks of one exposure; else None.
     """
 
@@ -74,6 +76,7 @@ class Channel:
     shading: Mapping[str, Shading]
     row_exponent: tuple[float, float]
     noise_spread: tuple[float, float]
+    photo_response: tuple[float, float]
     warm: Warm | None
 
 
@@ -130,7 +133,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
     noise_spread = read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf)
     of_rows = patterns, floor, shading, _row_exponent(found, c)
-    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, noise_spread, warm)
+    of_pixels = noise_spread, _photo_response(found, c, black[0], offset[0]), warm
+    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, *of_pixels)
 
 
 def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
@@ -178,6 +182,26 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
         return 0.0, np.inf
     pattern, low_side = _pattern(found, c)
     return offset_sigma(pattern, 0.0, low_side)
+
+
+def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) -> tuple[float, float]:
+    """Standard deviation of the response of pixels to light, relative (PRNU), and its error, from 2 x 2 blocks.
+
+    Of the flats that do not saturate; what dust and vignetting do to a block is small. An infinite error without any.
+    """
+    several = []
+    for group in found.groups:
+        signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
+        if group.kind != "flat" or group.n_frames < 2 or group.saturated_share[c] > MOST_SATURATED or signal <= 0:
+            continue
+        rows = len(found.sampled_rows) * plane_rows(found)
+        blocks = np.concatenate([double_differences(p.halves.level_dn, rows) for p in group.of(c)], axis=1)
+        sigma, error = offset_sigma(blocks, offset_dn, np.inf)
+        several.append((sigma / signal, max(error / signal, 1e-9)))
+    if not several:
+        return 0.0, np.inf
+    values, weight = np.array([value for value, _ in several]), np.array([error**-2.0 for _, error in several])
+    return float(values @ weight / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:

@@ -18,6 +18,7 @@ from hsnoise.effects import (
     DarkSignalNonuniformity,
     FrameOffset,
     HotPixels,
+    PhotoResponseNonuniformity,
     ReadNoiseNonuniformity,
     RowFixedPattern,
     RowNoise,
@@ -41,6 +42,7 @@ OF_PIXELS = (
     DarkSignalNonuniformity,
     HotPixels,
     ReadNoiseNonuniformity,
+    PhotoResponseNonuniformity,
     FrameOffset,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -50,6 +52,7 @@ OF_PIXELS = (
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.1  # smaller ones hardly show, and hits and jumps that were not left out look alike
+LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # deviations by chance, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
@@ -142,6 +145,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     noise_spread = _mean([c.noise_spread for c in pixel.channels])
     if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
         found["read_noise_nonuniformity"] = {"spread": noise_spread}
+    response = _mean([c.photo_response for c in pixel.channels])
+    if response[0] > max(THERE * response[1], LEAST_RESPONSE):
+        found["photo_response_nonuniformity"] = {"sigma": response}
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
         return found | _warm(pixel, gain, longest_s)

@@ -182,16 +182,16 @@ class FitResult:
         return {one.name: table[one.name] for one in self.params[effect].parameters(self.params.channels)}
 
     def in_dn(self, effect: str) -> dict[str, tuple[float, float, str]]:
-        """`rows_of`, but electrons as DN where the gain is unknown: `params` then has a gain of 1 DN/e-.
+        """`rows_of`, but where the gain is unknown, electrons as DN, by the gain that `params` has.
 
         Raises KeyError if the model has no such effect.
         """
-        rows_ = self._rows
-        names = [one.name for one in self.params[effect].parameters(self.params.channels)]
-        return {
-            name: (*rows_[name][:2], rows_[name][2].replace("e-", "DN") if name in self.withheld else rows_[name][2])
-            for name in names
-        }
+        gain, found = float(np.mean(np.asarray(self.params["gain"].value))), {}
+        for one in self.params[effect].parameters(self.params.channels):
+            value, error, unit = self._rows[one.name]
+            in_dn = (value * gain, error * gain, unit.replace("e-", "DN"))
+            found[one.name] = in_dn if one.name in self.withheld and not self.has_gain else (value, error, unit)
+        return found
 
     @property
     def outcome(self) -> str:

@@ -46,3 +46,20 @@ def test_three_effects_at_once_are_found_in_bias_frames():
     ):
         assert abs(value - truth) < 4 * error
     assert table["read_noise.sigma"][0] * gain == pytest.approx(12 * GAIN, rel=0.02)
+
+
+@pytest.mark.slow
+def test_what_frames_and_rows_share_is_added_at_once_where_no_single_effect_explains(rng):
+    """Bias frames of a CCD whose pedestal, rows and neighbours are off together; the likelihood pools the pixels."""
+    noise = 4.0 * rng.standard_normal((14, 96, 160))
+    noise -= 0.08 * np.roll(noise, 1, axis=2)
+    shared = 3.0 * rng.standard_normal((14, 1, 1)) + 1.5 * rng.standard_normal((14, 96, 1))
+    counts = np.round(300.0 + noise + shared).astype(np.uint16)
+    told: list[str] = []
+    story = hsnoise.improve(counts, exposure_s=0.0, shutter="global", max_steps=2, progress=told.append)
+    assert any("following each pixel" in sentence for sentence in told)
+    assert {"frame_offset", "row_noise"} <= set(story.params.names)
+    assert story.fit.in_dn("frame_offset")["frame_offset.sigma"][0] == pytest.approx(3.0, rel=0.4)  # of eleven frames
+    assert story.fit.in_dn("row_noise")["row_noise.sigma"][0] == pytest.approx(1.5, rel=0.05)
+    assert story.errors[-1] < 10
+    assert not story.fit.has_gain and " e-." not in str(story)
