@@ -20,9 +20,10 @@ from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
+from hsnoise.statistics.pixels.read_noise import read_noise_spread
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading, shading_of
-from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows, read_noise_spread
+from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
@@ -39,7 +40,7 @@ ROW_GAIN_THERE = 3.0
 TOGETHER = 6.0  # deviations by chance from which rows are not white
 LEAST_EXPONENT_ERROR = 0.01  # no spectrum is a power law
 ROUNDS = 30
-MOST_SATURATED = 1e-3  # share of the pixels of a flat
+MOST_SATURATED = 0.01  # share of the pixels of a flat that reach the highest count of all
 UNKNOWN = 1e6  # relative error of what is not known
 
 
@@ -191,8 +192,11 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
     """
     several = []
     for group in found.groups:
+        if group.kind != "flat" or group.n_frames < 2:
+            continue
         signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
-        if group.kind != "flat" or group.n_frames < 2 or group.saturated_share[c] > MOST_SATURATED or signal <= 0:
+        highest = np.concatenate([p.halves.highest for p in group.of(c)])
+        if signal <= 0 or (highest == highest.max()).mean() > MOST_SATURATED:
             continue
         rows = len(found.sampled_rows) * plane_rows(found)
         blocks = np.concatenate([double_differences(p.halves.level_dn, rows) for p in group.of(c)], axis=1)

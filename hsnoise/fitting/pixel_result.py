@@ -29,6 +29,7 @@ from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
+from hsnoise.statistics.pixels.population import Population
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.transfer import ROUNDING
 
@@ -51,7 +52,7 @@ OF_PIXELS = (
     BlackShading,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
-LEAST_NOISE_SPREAD = 0.1  # smaller ones hardly show, and hits and jumps that were not left out look alike
+LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # deviations by chance, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
@@ -154,22 +155,26 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     spread = _mean(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
-    hot = {
-        "fraction": _mean([p.hot_fraction for p, _ in many]),
-        "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in many]),
-        "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in many]),
-    }
-    tail = _mean([p.hot_spread for p, _ in many])
-    if tail[0] > 0:
-        hot["spread"] = tail
-    fano = _fano(pixel)
-    if fano is not None:
-        hot["fano"] = fano
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
-    if hot["fraction"][0] > THERE * hot["fraction"][1] and hot["rate"][0] > 0:
-        found["hot_pixels"] = hot
-    return found
+    return found | _hot(pixel, many)
+
+
+def _hot(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:
+    """Hot pixels, where most colours have them beyond chance: means over those colours."""
+    hot = [(p, g) for p, g in many if p.hot_fraction[0] > 0 and p.hot_rate[0] > 0]
+    if 2 * len(hot) <= len(many):
+        return {}
+    found = {
+        "fraction": _mean([p.hot_fraction for p, _ in hot]),
+        "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in hot]),
+        "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in hot]),
+    }
+    heavy = [p.hot_spread for p, _ in hot if p.hot_spread[0] > 0]
+    if 2 * len(heavy) > len(hot):
+        found["spread"] = _mean(heavy)
+    fano = _fano(pixel)
+    return {"hot_pixels": found if fano is None else found | {"fano": fano}}
 
 
 def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:

@@ -248,10 +248,11 @@ def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[
     """Sentences on numbers of effects that hardly moved from where the search started; covariance: of y."""
     deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
     told = []
-    for name, sigma in zip(problem.added.names, deviation, strict=True):
+    for number, sigma in zip(problem.added.numbers, deviation, strict=True):
+        name = number.name
         if sigma <= 0.7 * PRIOR_SIGMA:
             continue
-        value, error, unit = result.in_dn(name.partition(".")[0])[name]
+        value, error, unit = result.in_dn(number.effect)[name]
         if value < 2 * error:
             told.append(f"{near_zero(name, value, error, unit_in_words(unit))}.")
         else:

@@ -65,7 +65,7 @@ def test_the_time_ends_a_fit_at_the_next_draw(clock, stack, monkeypatch):
         self.counter(Event("Step 1: adding row_noise"), 40)()
 
     nearest = (SimpleNamespace(name="row_noise", score=99.0),)
-    found = SimpleNamespace(headline="", advice="", ranking=nearest)
+    found = SimpleNamespace(verdict="named", headline="", advice="", ranking=nearest)
     monkeypatch.setattr(improve, "diagnosed", lambda *_, **__: found)
     monkeypatch.setattr(improve, "_nearest", lambda found: nearest)
     monkeypatch.setattr(_Work, "first_that_holds", first_that_holds)

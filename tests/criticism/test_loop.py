@@ -158,7 +158,7 @@ def test_improve_finds_adds_and_ends(few_candidates):
 def test_step_compatible_with_zero_is_not_taken(sigma_e, error_e, there):
     """Only sizes count: a period far from 0 does not make a pattern of no amplitude a find."""
     rows = {"frame_offset.sigma": (sigma_e, error_e, "e-"), "row_noise.exponent": (1.0, 0.01, "")}
-    result = SimpleNamespace(params=MODEL, names=tuple(rows), table=rows)
+    result = SimpleNamespace(params=MODEL, names=tuple(rows), in_dn=lambda _: rows)
     assert is_there(fx.FrameOffset(sigma_e), result) is there
     assert is_there(fx.RowNoise(1.0), result)  # its size was not fitted: nothing speaks against it
 
@@ -176,9 +176,9 @@ def test_a_further_effect_needs_more_evidence(steps, error, score, too_little):
 def test_sizes_count_not_places():
     glow = fx.AmplifierGlow(0.1, 0.3)
     rows = {"amplifier_glow.rate": (0.1, 5.0, "e-/s"), "amplifier_glow.row": (0.5, 0.1, "1")}
-    assert not is_there(glow, SimpleNamespace(params=MODEL, names=tuple(rows), table=rows))
+    assert not is_there(glow, SimpleNamespace(params=MODEL, names=tuple(rows), in_dn=lambda _: rows))
     rows = {"odd_even_pattern.offset": (-0.5, 0.1, "e-"), "odd_even_pattern.gain_mismatch": (0.0, 0.1, "1")}
-    assert is_there(fx.OddEvenPattern(-0.5), SimpleNamespace(params=MODEL, names=tuple(rows), table=rows))
+    assert is_there(fx.OddEvenPattern(-0.5), SimpleNamespace(params=MODEL, names=tuple(rows), in_dn=lambda _: rows))
 
 
 @pytest.mark.parametrize(("effect", "needed"), [(fx.Crosstalk(3e-6), False), (fx.RowNoise(1.0), True)])

@@ -28,7 +28,8 @@ APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by
 SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ in dark current
 LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
-MOST_HOT = 0.3
+MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and where it counts as none
+HOT_FROM = 2.0  # mean extra of hot pixels, over the mean of the others
 WARM_SIGMAS = 6.0  # of the levels below the median
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
@@ -209,16 +210,21 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
         theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
     if len(excess) >= FEWEST_IN_TAIL:
         theta = _with_tail(loss, theta)
+    cool = _refit(loss, np.append(theta[:2], [COOL, theta[3]]), 2)
+    found = natural(theta)
+    there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
+    # Many pixels that are hardly warmer than the others are the tail of the others.
+    if not there or found[3] < HOT_FROM * found[0] or found[2] > 0.95 * MOST_HOT:
+        theta = cool
     values = np.array(natural(theta))
     units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3], values[4]])
     errors = np.append(_errors(loss, theta), np.full(5 - len(theta), np.inf)) * np.where(units > 0, units, 1.0)
-    alike, cool = theta.copy(), theta.copy()
-    alike[1], cool[2] = np.log(1e-3), -25.0
-    cool = cool[:4]
-    if values[1] < LEAST_SPREAD or 2 * (_refit(loss, alike, 1) - loss(theta)) < SIGNIFICANT:
-        values[1], errors[1] = 0.0, max(values[1], errors[1])
-    if len(excess) < 10 or 2 * (_refit(loss, cool, 2) - loss(theta)) < SIGNIFICANT:
+    if theta is cool:
         values[2:], errors[2:] = 0.0, np.inf
+    alike = theta.copy()
+    alike[1] = np.log(1e-3)
+    if values[1] < LEAST_SPREAD or 2 * (loss(_refit(loss, alike, 1)) - loss(theta)) < SIGNIFICANT:
+        values[1], errors[1] = 0.0, max(values[1], errors[1])
     return values, errors
 
 
@@ -238,16 +244,17 @@ def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
     return core * max(float(theta[0]), 1e-3), float(np.exp(np.clip(theta[1], -12, 1.2))), float(fraction), rate, tail
 
 
-def _refit(loss, theta: np.ndarray, held: int) -> float:
-    """The lowest loss with one parameter fixed."""
+def _refit(loss, theta: np.ndarray, held: int) -> np.ndarray:
+    """The numbers of the lowest loss with one of them fixed."""
     free = [i for i in range(len(theta)) if i != held]
 
-    def partial(some: np.ndarray) -> float:
-        whole = theta.copy()
-        whole[free] = some
-        return loss(whole)
+    def whole(some: np.ndarray) -> np.ndarray:
+        out = theta.copy()
+        out[free] = some
+        return out
 
-    return float(minimize(partial, theta[free], method="Nelder-Mead", options={"maxiter": 400, "fatol": 0.05}).fun)
+    options = {"maxiter": 400, "fatol": 0.05}
+    return whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
 
 
 def _errors(loss, theta: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hsnoise.statistics.pixels.classes import HOT_SIGMAS
-from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
+from hsnoise.statistics.pixels.sample import covariance_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
@@ -18,7 +18,6 @@ GROWN = 0.1  # of the variance of the shortest exposure
 HITS = 10.0  # ratio of the mean temporal variance to that of the typical pixel
 SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that is too large for a component of outliers
-FEWEST_PIXELS = 1000  # whose variances are compared
 STREAKS = 0.05  # growth of the variance of row means over that of pixels, above which streaks dominate
 CLIPPED = 0.6  # share of clipped counts above which moments over time say too little about the noise
 
@@ -147,46 +146,6 @@ def noise_spread(found: Survey, channel: int) -> float:
     top = np.quantile(np.concatenate([a, b]), 0.999)
     a, b = np.minimum(a, top), np.minimum(b, top)
     return float(np.sqrt(max(covariance_of(a, b), 0.0)) / max(a.mean(), 1e-12))
-
-
-def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[float, float]:
-    """Standard deviation of the logarithm of read noise over pixels, and its error; infinite where nothing tells.
-
-    read_dn2: mean square of the read noise, DN^2.
-
-    From the covariance of two temporal variances of each pixel, less what goes with its level and dark signal: shot
-    noise, telegraph noise. Pixels whose variance is an outlier are left out.
-    """
-    planes = [group.of(channel) for group in sorted(found.repeated_darks, key=lambda g: g.exposure_s)]
-    if not planes:
-        return 0.0, np.inf
-    moving = ~found.stuck(channel)
-    if len(planes) > 1:
-        first, second = (np.concatenate([p.halves.pair_variance_dn2 for p in of])[moving] for of in planes[:2])
-        frames = [len(of[0].halves.frame_means_dn) for of in planes[:2]]
-    else:
-        first, second = np.concatenate([p.halves.variance_dn2 for p in planes[0]], axis=1)[:, moving]
-        frames = list(planes[0][0].halves.n_frames)
-    levels = [np.concatenate([p.halves.level_dn for p in of], axis=1)[:, moving] for of in (planes[0], planes[-1])]
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        return 0.0, np.inf
-    kept = is_no_outlier(first, frames[0]) & is_no_outlier(second, frames[1])
-    if kept.sum() < FEWEST_PIXELS or read_dn2 <= 0:
-        return 0.0, np.inf
-    a, b, short, long = (x[..., kept].astype(np.float64) / np.sqrt(read_dn2) for x in (first, second, *levels))
-    a, b = a / np.sqrt(read_dn2), b / np.sqrt(read_dn2)
-    terms = (a - a.mean()) * (b - b.mean())
-    relative = float(terms.mean()) - _explained(a, b, [short, long - short][: len(planes)])
-    error = float(terms.std() / np.sqrt(len(terms)))
-    spread = np.sqrt(np.log1p(max(relative, 0.0))) / 2  # of ln sigma, where variances are log-normal
-    return float(spread), float(min(error / max(8 * spread, 1e-12), np.sqrt(error)))
-
-
-def _explained(a: np.ndarray, b: np.ndarray, by: list[np.ndarray]) -> float:
-    """Covariance of a and b [pixel] that follows from others [half, pixel], each known from two halves."""
-    same = np.array([[covariance_of(one[0], other[1]) for other in by] for one in by])
-    of_a, of_b = ([covariance_of(of, one[half]) for one in by] for of, half in ((a, 1), (b, 0)))
-    return max(float(of_a @ np.linalg.pinv((same + same.T) / 2, rcond=1e-6) @ of_b), 0.0)
 
 
 def has_patterns(found: Survey) -> bool:

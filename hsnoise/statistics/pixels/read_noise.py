@@ -1,0 +1,82 @@
+"""How much the read noise of pixels differs: two temporal variances of each pixel, which go together if it does."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from hsnoise.statistics.pixels.sample import covariance_of, without_outliers
+from hsnoise.statistics.pixels.survey import Survey
+
+FEWEST_PIXELS = 1000
+MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
+NOISIEST = 0.05  # share of the pixels that jump or are hit, at most
+SIMULATED = 100_000  # pixels
+
+
+def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[float, float]:
+    """Standard deviation of the logarithm of read noise over pixels, and its error; infinite where nothing tells.
+
+    read_dn2: mean square of the read noise, DN^2.
+
+    From the covariance of two temporal variances of each pixel, less what goes with its level and dark signal (shot
+    noise). The noisiest pixels are left out, because those that jump or are hit have another kind of noise; log-normal
+    read noise, drawn and cut in the same way, says what is left of its covariance.
+    """
+    planes = [group.of(channel) for group in sorted(found.repeated_darks, key=lambda g: g.exposure_s)]
+    if not planes:
+        return 0.0, np.inf
+    moving = ~found.stuck(channel)
+    first, second = np.concatenate([p.halves.variance_dn2 for p in planes[0]], axis=1)[:, moving]
+    frames = list(planes[0][0].halves.n_frames)
+    if len(planes) > 1:
+        whole = [np.concatenate([p.halves.pair_variance_dn2 for p in of])[moving] for of in planes[:2]]
+        # The variance over all frames is known better than that of halves, unless it is mostly shot noise.
+        if np.median(whole[1]) < MOSTLY_READ * np.median(whole[0]) or min(frames) < 2:
+            (first, second), frames = whole, [len(of[0].halves.frame_means_dn) for of in planes[:2]]
+    levels = [np.concatenate([p.halves.level_dn for p in of], axis=1)[:, moving] for of in (planes[0], planes[-1])]
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        return 0.0, np.inf
+    if len(first) < FEWEST_PIXELS or read_dn2 <= 0 or min(frames) < 2:
+        return 0.0, np.inf
+    kept = _is_quiet(first, second)
+    a, b, short, long = (x[..., kept].astype(np.float64) for x in (first, second, *levels))
+    a, b = a / a.mean(), b / b.mean()
+    terms = (a - a.mean()) * (b - b.mean())
+    left = float(terms.mean()) - _explained(a, b, [short, long - short][: len(planes)])
+    error = float(terms.std() / np.sqrt(len(terms)))
+    spreads, expected = _of_quiet(frames[0] - 1, frames[1] - 1)
+    spread, one_up = (float(np.interp(x, expected, spreads)) for x in (left, max(left, 0.0) + error))
+    # Of all noise; that of the read noise, which is only a part of it, is larger.
+    total = np.mean([without_outliers(of, n).mean() for of, n in zip((first, second), frames, strict=True)])
+    share = min(read_dn2 / float(total), 1.0)
+    whole = np.sqrt(np.log1p(np.expm1(4 * np.array([spread, one_up]) ** 2) / share**2)) / 2
+    return float(whole[0]), float(max(whole[1] - whole[0], 1e-6))
+
+
+def _is_quiet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """All pixels but the noisiest, by two temporal variances [pixel]."""
+    both = first / np.median(first) + second / np.median(second)
+    return both <= np.quantile(both, 1 - NOISIEST)
+
+
+@cache
+def _of_quiet(*dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Spreads of log-normal read noise, and covariances of the relative variances of the quiet pixels, rising."""
+    rng = np.random.default_rng(0)
+    z, chance = rng.standard_normal(SIMULATED), [rng.chisquare(n, SIMULATED) / n for n in dof]
+    spreads = np.linspace(0.0, 1.2, 25)
+    expected = []
+    for spread in spreads:
+        first, second = (np.exp(2 * spread * z) * one for one in chance)
+        kept = _is_quiet(first, second)
+        expected.append(covariance_of(first[kept] / first[kept].mean(), second[kept] / second[kept].mean()))
+    return spreads, np.maximum.accumulate(expected)
+
+
+def _explained(a: np.ndarray, b: np.ndarray, by: list[np.ndarray]) -> float:
+    """Covariance of a and b [pixel] that follows from others [half, pixel], each known from two halves."""
+    same = np.array([[covariance_of(one[0], other[1]) for other in by] for one in by])
+    of_a, of_b = ([covariance_of(of, one[half]) for one in by] for of, half in ((a, 1), (b, 0)))
+    return max(float(of_a @ np.linalg.pinv((same + same.T) / 2, rcond=1e-6) @ of_b), 0.0)
