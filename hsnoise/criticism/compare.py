@@ -187,7 +187,7 @@ def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
     gains = [(abs(row[4]) - abs(now[row[0]][1]), row) for row in before.table if row[0] in now]
     gains.sort(key=lambda gain: -gain[0])
     return tuple(
-        sentences.brought_nearer(name, measured, model, z, now[name][0])
+        sentences.brought_nearer(name, measured, (model, z), now[name])
         for gain, (name, _, measured, model, z) in gains[:WORST]
         if gain > rules.NOTABLE_GAIN
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsnoise._core.types import seconds, unit_in_words
-from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused, Verdict, has_sides
+from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused, Verdict, has_sides, side_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.fitting.result import number, rounded
 
@@ -74,9 +74,11 @@ def off(name: str, measured: float, model: float, z: float) -> str:
     return f"{name}: measured {measured:.3g}, the model gives {model:.3g} ({_deviations(z)})"
 
 
-def brought_nearer(name: str, measured: float, model: float, z: float, now: float) -> str:
-    """A statistic that a new model gives better; model, now: its values under the old model and the new one."""
-    return f"{name}: measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)}), with the effect {now:.3g}"
+def brought_nearer(name: str, measured: float, old: tuple[float, float], new: tuple[float, float]) -> str:
+    """A statistic that a new model gives better; old, new: its value under either model, and how far that is off."""
+    (model, z), (now, left) = old, new
+    before = f"measured {measured:.3g}, the model gave {model:.3g} ({_deviations(z)})"
+    return f"{name}: {before}, with the effect {now:.3g} (off by {abs(left):.1f})"
 
 
 def _deviations(z: float) -> str:
@@ -221,7 +223,11 @@ def sizes(rows: Mapping[str, tuple[float, float, str]], effect: AbstractEffect, 
         of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
         said.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip() + ".")
     chosen = effect.settings().items()
-    said += [f"{effect.name}.{field}: {value}." for field, value in chosen if value is not None]
+    said += [
+        f"{effect.name}.{field}: {value}." for field, value in chosen if value is not None and field != "after_gain"
+    ]
+    if has_sides(effect):
+        said.append(f"{effect.name} arises {side_of(effect)}.")
     if sides_open:
         said.append(
             f"{effect.name} fits equally well on the other side of the gain: these frames do not determine the side."
