@@ -6,11 +6,12 @@ from functools import cache
 
 import numpy as np
 
-from hsnoise.statistics.pixels.sample import covariance_of, without_outliers
+from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
 from hsnoise.statistics.pixels.survey import Survey
 
 FEWEST_PIXELS = 1000
 MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
+SURE = 8.0  # standard errors from which quiet pixels differ: telegraph noise that is not cut reaches 5
 NOISIEST = 0.05  # share of the pixels that jump or are hit, at most
 SIMULATED = 100_000  # pixels
 
@@ -21,8 +22,9 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
     read_dn2: mean square of the read noise, DN^2.
 
     From the covariance of two temporal variances of each pixel, less what goes with its level and dark signal (shot
-    noise). The noisiest pixels are left out, because those that jump or are hit have another kind of noise; log-normal
-    read noise, drawn and cut in the same way, says what is left of its covariance.
+    noise). Without the noisiest pixels, because those that jump or are hit have another kind of noise; log-normal read
+    noise, drawn and cut in the same way, says what is left of its covariance. If so cut the quiet pixels differ beyond
+    chance, the spread is that of all pixels but the outliers.
     """
     planes = [group.of(channel) for group in sorted(found.repeated_darks, key=lambda g: g.exposure_s)]
     if not planes:
@@ -40,19 +42,25 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
         return 0.0, np.inf
     if len(first) < FEWEST_PIXELS or read_dn2 <= 0 or min(frames) < 2:
         return 0.0, np.inf
-    kept = _is_quiet(first, second)
-    a, b, short, long = (x[..., kept].astype(np.float64) for x in (first, second, *levels))
-    a, b = a / a.mean(), b / b.mean()
-    terms = (a - a.mean()) * (b - b.mean())
-    left = float(terms.mean()) - _explained(a, b, [short, long - short][: len(planes)])
-    error = float(terms.std() / np.sqrt(len(terms)))
+    by = [levels[0], levels[1] - levels[0]][: len(planes)]
+    left, error = _together(first, second, by, _is_quiet(first, second))
     spreads, expected = _of_quiet(frames[0] - 1, frames[1] - 1)
-    spread, one_up = (float(np.interp(x, expected, spreads)) for x in (left, max(left, 0.0) + error))
-    # Of all noise; that of the read noise, which is only a part of it, is larger.
-    total = np.mean([without_outliers(of, n).mean() for of, n in zip((first, second), frames, strict=True)])
-    share = min(read_dn2 / float(total), 1.0)
-    whole = np.sqrt(np.log1p(np.expm1(4 * np.array([spread, one_up]) ** 2) / share**2)) / 2
-    return float(whole[0]), float(max(whole[1] - whole[0], 1e-6))
+    if left - expected[0] < SURE * error:
+        return 0.0, float(np.interp(expected[0] + error, expected, spreads))
+    usual = is_no_outlier(first, frames[0]) & is_no_outlier(second, frames[1])
+    left, error = _together(first, second, by, usual)
+    # Read noise is only a part of all noise, and differs by more.
+    share = min(read_dn2 / float(np.sqrt(first[usual].mean() * second[usual].mean())), 1.0)
+    spread, one_up = (float(np.sqrt(np.log1p(x / share**2)) / 2) for x in (max(left, 0.0), max(left, 0.0) + error))
+    return spread, max(one_up - spread, 1e-6)
+
+
+def _together(first: np.ndarray, second: np.ndarray, by: list[np.ndarray], kept: np.ndarray) -> tuple[float, float]:
+    """Covariance of two relative variances over the pixels that are kept, less what goes with `by`, and its error."""
+    a, b = (of[kept].astype(np.float64) / of[kept].mean() for of in (first, second))
+    terms = (a - a.mean()) * (b - b.mean())
+    explained = _explained(a, b, [one[:, kept].astype(np.float64) for one in by])
+    return float(terms.mean()) - explained, float(terms.std() / np.sqrt(len(terms)))
 
 
 def _is_quiet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
