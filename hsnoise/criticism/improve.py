@@ -125,18 +125,12 @@ def improved(
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
-    first = fit(fitted, model=model)
-    if not first.has_gain:
-        work = replace(work, portion=portion.without_flats("the gain is not determined, and flats need it"))
-    unlimited = replace(work, limit=NO_LIMIT)
-    steps = unlimited.begun(first)
-    if not first.has_gain:
-        steps = unlimited.pixels_followed(steps) or steps
+    steps = replace(work, limit=NO_LIMIT).started(fit(fitted, model=model))
     while (ending := limit.reached(sum(step.diagnosis is not None for step in steps[:-1]))) is None:
         keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split))
         own = [c for c in candidates if c.name not in steps[-1].fit.params]
         try:
-            ending = work.turn(steps, own)
+            ending = work.seeing(steps[-1].fit).turn(steps, own)
         except TimeIsUp:
             continue
         if ending is not None:
@@ -174,6 +168,12 @@ class _Work:
         log.info("%s", event)
         self.tell(event)
 
+    def seeing(self, of: FitResult) -> _Work:
+        """Itself for steps of this fit: without flats if the gain is unknown."""
+        if of.has_gain:
+            return self
+        return replace(self, portion=self.portion.without_flats("the gain is not determined, and flats need it"))
+
     def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
         """Diagnose the last step, and append one more; if there is none, how the story ends.
 
@@ -183,9 +183,12 @@ class _Work:
         tick = self.counter(_stage("looking for what is missing", steps))
         found = diagnosed(last.fit, self.portion, tuple(own), seed=self.seed, tick=tick)
         steps[-1] = last = replace(last, diagnosis=found)
-        if found.verdict == Verdict.UNEXPLAINED and (other := self.pixels_followed(steps)) is not None:
-            steps[:] = other
-            return None
+        # Where the first fit had no gain, they were followed from the start, if that was any better.
+        if found.verdict == Verdict.UNEXPLAINED and last.fit.has_gain:
+            followed = self.pixels_followed(steps)
+            if followed is not None:
+                steps[:] = self.seeing(followed).begun(followed)
+                return None
         nearest = _nearest(found)
         if not nearest:
             return _ending(found, last.comparison)
@@ -216,6 +219,13 @@ class _Work:
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
 
+    def started(self, first: FitResult) -> list[Step]:
+        """The first steps of a fit, or where it has no gain, of one that follows each pixel if that comes nearer."""
+        seeing = self.seeing(first)
+        steps = seeing.begun(first)
+        followed = None if first.has_gain else seeing.pixels_followed(steps)
+        return steps if followed is None else self.seeing(followed).begun(followed)
+
     def begun(self, first: FitResult) -> list[Step]:
         """The first steps: the paper's model, then one by one what its fit measured beyond it."""
         steps = [self.step(first.without(first.added), None, [])]
@@ -224,13 +234,13 @@ class _Work:
             steps.append(self.step(first.without(first.added[i + 1 :]), name, steps))
         return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
 
-    def pixels_followed(self, steps: Sequence[Step]) -> list[Step] | None:
-        """The story begun anew by a fit that follows each pixel, if that comes much nearer than pooled pixels.
+    def pixels_followed(self, steps: Sequence[Step]) -> FitResult | None:
+        """A fit that follows each pixel, if it comes much nearer than the pooled pixels of the only step.
 
         It measures what frames, rows and columns share, all at once, which no single effect explains. A gain that
         nothing casts doubt on is not given up for it.
         """
-        pooled = steps[-1].fit
+        pooled, before = steps[-1].fit, steps[-1].comparison.error
         if len(steps) > 1 or self.given or pooled.method not in (Method.ML, Method.LINE):
             return None
         stage = _stage("following each pixel over time", steps)
@@ -242,14 +252,15 @@ class _Work:
             return None
         if not result.added or (pooled.has_gain and not result.has_gain and pooled.trustworthy):
             return None
-        before = steps[-1].comparison.error
-        status = replace(result, status=Status.NEARER, detail=number(before))
-        begun = self.begun(status)
+        judged = self.seeing(result).portion
+        if judged is not self.portion:
+            before = compared(pooled.params, judged, seed=self.seed).error
+        after = compared(result.params, judged, seed=self.seed, tick=self.counter(stage, DRAWS)).error
         # Without a gain, pooled pixels leave the size of every effect in e- open.
-        if begun[-1].comparison.error > (rules.HALF if pooled.has_gain else 1.0) * before:
-            self.say(Event(f"pixels stay pooled: following them leaves an error of {begun[-1].comparison.error:.2f}"))
+        if after > (rules.HALF if pooled.has_gain else 1.0) * before:
+            self.say(Event(f"pixels stay pooled: following them leaves an error of {number(after)}"))
             return None
-        return begun
+        return replace(result, status=Status.NEARER, detail=number(before))
 
     def first_that_holds(
         self, candidates: Sequence[Candidate], steps: list[Step]

@@ -19,7 +19,7 @@ improve = importlib.import_module("hsnoise.criticism.improve")
 
 
 def step(error: float) -> Step:
-    fit = SimpleNamespace(params=hsnoise.cameras.grasshopper3())
+    fit = SimpleNamespace(params=hsnoise.cameras.grasshopper3(), has_gain=True)
     return Step(fit, SimpleNamespace(error=error, fits=error < rules.FITS), None, None, float("nan"), ())
 
 
@@ -95,3 +95,15 @@ def test_a_stage_tells_its_step_and_the_error_until_now():
     assert str(_stage("comparing", [])) == "Step 0: comparing"
     assert str(_stage("looking", [step(26.34)])) == "Step 1: looking; error 26.3"
     assert str(_stage("looking", [step(26.34), step(9.0), step(1.59)])) == "Step 3: looking; error 26.3 -> 1.59"
+
+
+def test_flats_are_compared_if_the_fit_that_the_story_starts_from_has_a_gain(monkeypatch):
+    """Pooled pixels may leave it unknown where each pixel over time, and the flats, give it."""
+    without, told = object(), []
+    portion = SimpleNamespace(without_flats=lambda why: without)
+    followed = SimpleNamespace(has_gain=True)
+    monkeypatch.setattr(_Work, "begun", lambda self, first: told.append((first, self.portion)) or [first])
+    monkeypatch.setattr(_Work, "pixels_followed", lambda self, steps: followed)
+    pooled = SimpleNamespace(has_gain=False)
+    assert _Work(None, portion, None, 0, print).started(pooled) == [followed]
+    assert told == [(pooled, without), (followed, portion)]
