@@ -227,14 +227,12 @@ def _spreads(found: Survey, channel: int) -> dict[str, PixelSpread]:
     darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     if not darks:
         return {}
-    halves = [p.halves for p in darks[0].of(channel)]
-    level = np.concatenate([h.level_dn for h in halves], 1)
-    spreads = {"offset": _spread(level, "DN")}
+    spreads = {"offset": _spread(darks[0].pixels(channel, "level_dn"), "DN")}
     pixels = levels_of(found, channel)
     if pixels is not None:
         spreads["dark signal"] = _spread(slope_over(pixels.exposure_s, pixels.level), "DN/s")
-    if min(halves[0].n_frames) > 1:
-        noise = np.concatenate([h.variance_dn2 for h in halves], 1)
+    if min(darks[0].of(channel)[0].halves.n_frames) > 1:
+        noise = darks[0].pixels(channel, "variance_dn2")
         one = _spread(noise, "DN²")
         sigma = np.sqrt(float(noise.mean(dtype=np.float64)))
         tail = np.sqrt(max(one.median + one.tail, 0.0)) - np.sqrt(max(one.median, 0.0))

@@ -221,7 +221,8 @@ def sizes(rows: Mapping[str, tuple[float, float, str]], effect: AbstractEffect, 
     for label, (value, error, unit) in rows.items():
         size, of = rounded(value, error)
         of = f"± {of}" if error > 0 and np.isfinite(error) else f"({of})"
-        said.append(f"{label} = {size} {of} {unit_in_words(unit)}".rstrip() + ".")
+        how = f"{size} {of} {unit_in_words(unit)}" if np.isfinite(value) else size
+        said.append(f"{label} = {how}".rstrip() + ".")
     chosen = effect.settings().items()
     said += [
         f"{effect.name}.{field}: {value}." for field, value in chosen if value is not None and field != "after_gain"

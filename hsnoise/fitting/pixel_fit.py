@@ -132,10 +132,23 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     if warm is not None:  # many warm pixels move the median of all: what is not theirs is black
         share, extra = warm.fraction[0], warm.extra_dn[0]
         black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
-    noise_spread = read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf)
-    of_rows = patterns, floor, shading, _row_exponent(found, c)
-    of_pixels = noise_spread, _photo_response(found, c, black[0], offset[0]), warm
-    return Channel(name, transfer, population, offset, values, covariance, black, rows, *of_rows, *of_pixels)
+    return Channel(
+        name=name,
+        transfer=transfer,
+        population=population,
+        offset_dn=offset,
+        values=values,
+        covariance=covariance,
+        black_dn=black,
+        row_gain=rows,
+        patterns=patterns,
+        temporal_dn2=floor,
+        shading=shading,
+        row_exponent=_row_exponent(found, c),
+        noise_spread=read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf),
+        photo_response=_photo_response(found, c, black[0], offset[0]),
+        warm=warm,
+    )
 
 
 def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
@@ -160,10 +173,9 @@ def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
 
 
 def _warm(found: Survey, c: int) -> Warm | None:
-    planes = _shortest(found, c)
-    if not planes:
+    if found.shortest is None:
         return None
-    return warm_of(np.concatenate([p.halves.level_dn for p in planes], 1), len(planes[0].column_mean_dn))
+    return warm_of(found.shortest.pixels(c, "level_dn"), len(_shortest(found, c)[0].column_mean_dn))
 
 
 def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
@@ -195,25 +207,32 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
         if group.kind != "flat" or group.n_frames < 2:
             continue
         signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
-        highest = np.concatenate([p.halves.highest for p in group.of(c)])
+        highest = group.pixels(c, "highest")
         if signal <= 0 or (highest == highest.max()).mean() > MOST_SATURATED:
             continue
-        rows = len(found.sampled_rows) * plane_rows(found)
-        blocks = np.concatenate([double_differences(p.halves.level_dn, rows) for p in group.of(c)], axis=1)
-        sigma, error = offset_sigma(blocks, offset_dn, np.inf)
+        sigma, error = offset_sigma(_blocks(found, group.of(c)), offset_dn, np.inf)
         several.append((sigma / signal, max(error / signal, 1e-9)))
-    if not several:
-        return 0.0, np.inf
-    values, weight = np.array([value for value, _ in several]), np.array([error**-2.0 for _, error in several])
-    return float(values @ weight / weight.sum()), float(weight.sum() ** -0.5)
+    return weighted_mean(several) if several else (0.0, np.inf)
+
+
+def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of values with these errors, each weighted by its information, and its error."""
+    values, errors = np.array(pairs, float).T
+    weight = errors**-2
+    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
     """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
+    planes, rows = _shortest(found, c), len(found.sampled_rows) * plane_rows(found)
+    low_side = float(np.mean([low_side_sigma(plane.halves.level_dn, rows) for plane in planes]))
+    return _blocks(found, planes), low_side
+
+
+def _blocks(found: Survey, planes: list[Plane]) -> np.ndarray:
+    """What pixels of 2 x 2 blocks differ by [half, block], DN."""
     rows = len(found.sampled_rows) * plane_rows(found)
-    levels = [p.halves.level_dn for p in _shortest(found, c)]
-    low_side = float(np.mean([low_side_sigma(one, rows) for one in levels]))
-    return np.concatenate([double_differences(one, rows) for one in levels], axis=1), low_side
+    return np.concatenate([double_differences(plane.halves.level_dn, rows) for plane in planes], axis=1)
 
 
 def _shortest(found: Survey, c: int) -> list[Plane]:
@@ -261,7 +280,7 @@ def _temporal(found: Survey, c: int) -> tuple[float, float]:
     group = found.shortest
     if group is None:
         return 0.0, UNKNOWN
-    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
+    variance = group.pixels(c, "pair_variance_dn2").astype(np.float64)
     variance = variance[~found.stuck(c)]
     if not (variance > 0).any():
         return 0.0, UNKNOWN

@@ -23,7 +23,7 @@ from hsnoise.effects import (
     RowFixedPattern,
     RowNoise,
 )
-from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit
+from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit, weighted_mean
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -209,8 +209,7 @@ def _fano(pixel: PixelFit) -> tuple[float, float] | None:
         told.append((ratio, ratio * np.hypot(t.hot_error / t.hot_gain, error / gain)))
     if not told:
         return None
-    weight = np.array([e**-2 for _, e in told])
-    value, error = float(weight @ [v for v, _ in told] / weight.sum()), float(weight.sum() ** -0.5)
+    value, error = weighted_mean(told)
     return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
 
 

@@ -186,11 +186,13 @@ class FitResult:
 
         Raises KeyError if the model has no such effect.
         """
-        gain, found = float(np.mean(np.asarray(self.params["gain"].value))), {}
-        for one in self.params[effect].parameters(self.params.channels):
-            value, error, unit = self._rows[one.name]
-            in_dn = (value * gain, error * gain, unit.replace("e-", "DN"))
-            found[one.name] = in_dn if one.name in self.withheld and not self.has_gain else (value, error, unit)
+        found = self.rows_of(effect)
+        if self.has_gain:
+            return found
+        gain, fitted = float(np.mean(np.asarray(self.params["gain"].value))), self._rows
+        for name in found.keys() & set(self.withheld):
+            value, error, unit = fitted[name]
+            found[name] = (value * gain, error * gain, unit.replace("e-", "DN"))
         return found
 
     @property

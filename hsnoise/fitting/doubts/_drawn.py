@@ -128,13 +128,13 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
 
 def _typical(group: Group, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels without outliers, DN^2, and its standard error."""
-    variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)]).astype(np.float64)
+    variance = group.pixels(c, "pair_variance_dn2").astype(np.float64)
     kept = without_outliers(variance, group.n_frames)
     return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
 
 
 def _median(group: Group, c: int) -> float:
-    return float(np.median(np.concatenate([p.halves.level_dn.mean(0) for p in group.of(c)])))
+    return float(np.median(group.pixels(c, "level_dn").mean(0)))
 
 
 def _shared_by_rows(group: Group, c: int) -> Component:

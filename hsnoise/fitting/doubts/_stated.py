@@ -86,7 +86,7 @@ def _white_level(result: FitResult, seen: Evidence) -> Iterator[str]:
 
 def _highest(group: Group, moving: list[np.ndarray]) -> np.ndarray:
     """The highest count of each pixel, without stuck pixels."""
-    of = [np.concatenate([p.halves.highest for p in group.of(c)])[kept] for c, kept in enumerate(moving)]
+    of = [group.pixels(c, "highest")[kept] for c, kept in enumerate(moving)]
     return np.concatenate(of).astype(np.float64)
 
 

@@ -44,8 +44,8 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
     share = _outlier_share(result)
-    alone = list(_by_shape_alone(result))
-    grave += alone if is_extraordinary(result) else []
+    alone = tuple(_by_shape_alone(result))
+    grave += alone if is_extraordinary(result) else ()
     minor = (
         *alone,
         *header_gain(result),

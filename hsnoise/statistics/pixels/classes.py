@@ -80,16 +80,14 @@ def levels_of(found: Survey, channel: int) -> Levels | None:
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
-    halves = [[p.halves for p in g.of(channel)] for g in groups]
     moving = ~found.stuck(channel)
-    level, variance, peak = (
-        np.stack([np.concatenate([getattr(h, name) for h in of], 1)[:, moving] for of in halves])
-        for name in ("level_dn", "variance_dn2", "peak_dn")
-    )
     if moving.sum() < FEWEST_ALIVE:
         return None
-    whole = np.stack([np.concatenate([h.pair_variance_dn2 for h in of])[moving] for of in halves])
-    sigma = _pedestal_sigmas([np.mean([h.frame_means_dn for h in of], axis=0) for of in halves])
+    level, variance, peak, whole = (
+        np.stack([g.pixels(channel, name)[..., moving] for g in groups])
+        for name in ("level_dn", "variance_dn2", "peak_dn", "pair_variance_dn2")
+    )
+    sigma = _pedestal_sigmas([np.mean([p.halves.frame_means_dn for p in g.of(channel)], axis=0) for g in groups])
     sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
     return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
 

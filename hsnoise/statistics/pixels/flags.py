@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from hsnoise.statistics.pixels.classes import hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.sample import of_neighbours
-from hsnoise.statistics.pixels.survey import Survey
+from hsnoise.statistics.pixels.survey import Group, Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
 DIM = 0.5  # of the median response of its neighbours: below it a pixel is dead
@@ -31,8 +31,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
         growth = slope_over(pixels.exposure_s, pixels.level)
         moving = np.flatnonzero(~stuck)
         flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
-    dark = [[p.halves for p in g.of(channel)] for g in found.repeated_darks]
-    flags[_jumping(dark, len(flags)) & ~stuck] |= FLAGS["telegraph"]
+    flags[_jumping(found.repeated_darks, channel, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
 
 
@@ -47,12 +46,12 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
     They are compared with their neighbours in the row: light may fall off by any factor over a frame.
     """
     flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
-    level = [np.concatenate([p.halves.level_dn.mean(0) for p in g.of(channel)]) for g in flats]
+    level = [g.pixels(channel, "level_dn").mean(0) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
     darks, frames = found.repeated_darks, flats[bright].n_frames
     black, noise = np.zeros_like(level[bright]), 0.0
     if darks:
-        black = np.concatenate([p.halves.level_dn.mean(0) for p in darks[0].of(channel)])
+        black = darks[0].pixels(channel, "level_dn").mean(0)
         noise = darks[0].noise_dn * np.sqrt(1 / frames + 1 / darks[0].n_frames)
     signal = level[bright] - black
     least = LIT_SIGMAS * noise
@@ -63,18 +62,17 @@ def _dead(found: Survey, channel: int) -> np.ndarray:
     return (signal < DIM * nearby) | ((nearby < least) & (signal < least))
 
 
-def _jumping(halves, pixels: int) -> np.ndarray:
+def _jumping(groups: tuple[Group, ...], channel: int, pixels: int) -> np.ndarray:
     """Pixels much noisier than others of their level, in both halves of an exposure's frames."""
     found = np.zeros(pixels, bool)
-    for of in halves:
-        dof = np.array(of[0].n_frames) - 1
+    for group in groups:
+        dof = np.array(group.of(channel)[0].halves.n_frames) - 1
         if dof.min() < 1:
             continue
-        variance = np.concatenate([h.variance_dn2 for h in of], 1)
-        level = np.concatenate([h.level_dn for h in of], 1).mean(0)
-        expected = _of_their_level(level, np.concatenate([h.pair_variance_dn2 for h in of]))
+        level = group.pixels(channel, "level_dn").mean(0)
+        expected = _of_their_level(level, group.pixels(channel, "pair_variance_dn2"))
         limit = chi2.isf(RARE, dof) / dof
-        found |= (variance / np.maximum(expected, 0.25) > limit[:, None]).all(0)
+        found |= (group.pixels(channel, "variance_dn2") / np.maximum(expected, 0.25) > limit[:, None]).all(0)
     return found
 
 

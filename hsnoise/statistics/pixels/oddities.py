@@ -119,7 +119,7 @@ def lit_darks(found: Survey) -> Iterator[str]:
 
 def _levels(group: Group, c: int) -> np.ndarray:
     """Level of each pixel of a channel in two halves of the frames [half, pixel], DN."""
-    return np.concatenate([p.halves.level_dn for p in group.of(c)], 1).astype(np.float64)
+    return group.pixels(c, "level_dn").astype(np.float64)
 
 
 def pixels_apart(found: Survey) -> Iterator[str]:

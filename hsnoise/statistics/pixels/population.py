@@ -206,8 +206,7 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
     share = float(np.clip(len(excess) / len(growth), 1e-5, 0.1))
     theta = np.array([middle / core, np.log(0.2), np.log(share / (MOST_HOT - share)), np.log(rate / core)])
-    for _ in range(2):
-        theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
+    theta = _least(loss, theta)
     if len(excess) >= FEWEST_IN_TAIL:
         theta = _with_tail(loss, theta)
     cool = _refit(loss, np.append(theta[:2], [COOL, theta[3]]), 2)
@@ -230,10 +229,15 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _with_tail(loss, theta: np.ndarray) -> np.ndarray:
     """The numbers with a tail heavier than exponential, if that is significant, else as they are."""
-    start = np.append(theta, np.log(0.5))
-    for _ in range(2):
-        start = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
-    return start if 2 * (loss(theta) - loss(start)) > SIGNIFICANT else theta
+    heavy = _least(loss, np.append(theta, np.log(0.5)))
+    return heavy if 2 * (loss(theta) - loss(heavy)) > SIGNIFICANT else theta
+
+
+def _least(loss, theta: np.ndarray) -> np.ndarray:
+    """The numbers of the lowest loss, from `theta`."""
+    for _ in range(2):  # a simplex that has shrunk on the way begins anew
+        theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
+    return theta
 
 
 def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
-from hsnoise.statistics.pixels.survey import Survey
+from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
 MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
@@ -26,23 +26,14 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
     noise, drawn and cut in the same way, says what is left of its covariance. If so cut the quiet pixels differ beyond
     chance, the spread is that of all pixels but the outliers.
     """
-    planes = [group.of(channel) for group in sorted(found.repeated_darks, key=lambda g: g.exposure_s)]
-    if not planes:
+    groups, moving = sorted(found.repeated_darks, key=lambda g: g.exposure_s), ~found.stuck(channel)
+    if not groups or moving.sum() < FEWEST_PIXELS or read_dn2 <= 0:
         return 0.0, np.inf
-    moving = ~found.stuck(channel)
-    first, second = np.concatenate([p.halves.variance_dn2 for p in planes[0]], axis=1)[:, moving]
-    frames = list(planes[0][0].halves.n_frames)
-    if len(planes) > 1:
-        whole = [np.concatenate([p.halves.pair_variance_dn2 for p in of])[moving] for of in planes[:2]]
-        # The variance over all frames is known better than that of halves, unless it is mostly shot noise.
-        if np.median(whole[1]) < MOSTLY_READ * np.median(whole[0]) or min(frames) < 2:
-            (first, second), frames = whole, [len(of[0].halves.frame_means_dn) for of in planes[:2]]
-    levels = [np.concatenate([p.halves.level_dn for p in of], axis=1)[:, moving] for of in (planes[0], planes[-1])]
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+    (first, second), frames = _variances(groups, channel, moving)
+    if min(frames) < 2:
         return 0.0, np.inf
-    if len(first) < FEWEST_PIXELS or read_dn2 <= 0 or min(frames) < 2:
-        return 0.0, np.inf
-    by = [levels[0], levels[1] - levels[0]][: len(planes)]
+    short, long = (group.pixels(channel, "level_dn")[:, moving] for group in (groups[0], groups[-1]))
+    by = [short, long - short][: len(groups)]
     left, error = _together(first, second, by, _is_quiet(first, second))
     spreads, expected = _of_quiet(frames[0] - 1, frames[1] - 1)
     if left - expected[0] < SURE * error:
@@ -53,6 +44,19 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
     share = min(read_dn2 / float(np.sqrt(first[usual].mean() * second[usual].mean())), 1.0)
     spread, one_up = (float(np.sqrt(np.log1p(x / share**2)) / 2) for x in (max(left, 0.0), max(left, 0.0) + error))
     return spread, max(one_up - spread, 1e-6)
+
+
+def _variances(groups: list[Group], channel: int, moving: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Two temporal variances of each pixel [2, pixel], DN^2, and how many frames each is from; the shortest first.
+
+    Those of two exposures, each known better than that of half of the frames, unless the second is mostly shot noise.
+    """
+    halves = groups[0].of(channel)[0].halves.n_frames
+    if len(groups) > 1:
+        whole = np.stack([group.pixels(channel, "pair_variance_dn2")[moving] for group in groups[:2]])
+        if np.median(whole[1]) < MOSTLY_READ * np.median(whole[0]) or min(halves) < 2:
+            return whole, (groups[0].n_frames, groups[1].n_frames)
+    return groups[0].pixels(channel, "variance_dn2")[:, moving], halves
 
 
 def _together(first: np.ndarray, second: np.ndarray, by: list[np.ndarray], kept: np.ndarray) -> tuple[float, float]:

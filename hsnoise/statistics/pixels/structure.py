@@ -102,7 +102,7 @@ def variance_grows(found: Survey) -> bool:
     for c in range(len(found.channels)):
         ends = []
         for group in (groups[0], groups[-1]):
-            variance = np.concatenate([p.halves.pair_variance_dn2 for p in group.of(c)])
+            variance = group.pixels(c, "pair_variance_dn2")
             middle = float(np.median(variance))
             width = 1.4826 * float(np.median(np.abs(variance - middle)))
             # With few frames the median lies below the mean, by the same factor for all pixels.
@@ -141,8 +141,8 @@ def noise_spread(found: Survey, channel: int) -> float:
     groups = [g for g in found.darks if min(g.n_frames // 2, g.n_frames - g.n_frames // 2) > 1]
     if not groups:
         return 0.0
-    halves = [p.halves for p in min(groups, key=lambda g: g.exposure_s).of(channel)]
-    a, b = np.concatenate([h.variance_dn2 for h in halves], 1).astype(np.float64)
+    shortest = min(groups, key=lambda g: g.exposure_s)
+    a, b = shortest.pixels(channel, "variance_dn2").astype(np.float64)
     top = np.quantile(np.concatenate([a, b]), 0.999)
     a, b = np.minimum(a, top), np.minimum(b, top)
     return float(np.sqrt(max(covariance_of(a, b), 0.0)) / max(a.mean(), 1e-12))
@@ -164,10 +164,10 @@ def _always_bright(found: Survey, channel: int) -> float:
     several = found.repeated_darks
     if not several:
         return 0.0
-    halves = [p.halves for p in max(several, key=lambda g: g.exposure_s).of(channel)]
-    lowest = np.concatenate([h.lowest for h in halves]).astype(np.float64)
-    sigma = float(np.sqrt(np.median(np.concatenate([h.pair_variance_dn2 for h in halves]))))
-    level = float(np.median(np.concatenate([h.level_dn for h in halves], 1)))
+    longest = max(several, key=lambda g: g.exposure_s)
+    lowest = longest.pixels(channel, "lowest").astype(np.float64)
+    sigma = float(np.sqrt(np.median(longest.pixels(channel, "pair_variance_dn2"))))
+    level = float(np.median(longest.pixels(channel, "level_dn")))
     return float(np.mean((lowest > level + HOT_SIGMAS * max(sigma, 0.5))[~found.stuck(channel)]))
 
 

@@ -71,6 +71,10 @@ class Group:
         """The planes of one channel."""
         return [plane for plane in self.planes if plane.channel == channel]
 
+    def pixels(self, channel: int, name: str) -> np.ndarray:
+        """An attribute of `Halves` of all sampled pixels of a channel, [half, pixel] or [pixel]."""
+        return np.concatenate([getattr(plane.halves, name) for plane in self.of(channel)], axis=-1)
+
     @property
     def noise_dn(self) -> float:
         """Temporal noise of the typical pixel, from two or more frames; 0 where rounding hides it."""
@@ -91,12 +95,10 @@ class Survey:
 
     def stuck(self, channel: int) -> np.ndarray:
         """Sampled pixels of a channel [pixel] with the same count in all frames of the noisy groups."""
-        halves = [[p.halves for p in g.of(channel)] for g in self.groups if g.n_frames > 1]
-        still = [np.concatenate([h.lowest == h.highest for h in of]) for of in halves]
-        noisy: list[bool] = [
-            bool(np.median(np.concatenate([h.pair_variance_dn2 for h in of])) > NOISY_DN**2) for of in halves
-        ]
-        frames = np.sum([of[0].n_frames for of, loud in zip(halves, noisy, strict=True) if loud])
+        several = [g for g in self.groups if g.n_frames > 1]
+        still = [g.pixels(channel, "lowest") == g.pixels(channel, "highest") for g in several]
+        noisy = [bool(np.median(g.pixels(channel, "pair_variance_dn2")) > NOISY_DN**2) for g in several]
+        frames = np.sum([g.of(channel)[0].halves.n_frames for g, loud in zip(several, noisy, strict=True) if loud])
         if frames < FEWEST_STILL:  # so few may agree by chance
             return np.zeros(len(still[0]) if still else 0, bool)
         return np.all([s for s, loud in zip(still, noisy, strict=True) if loud], axis=0)
