@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 
@@ -129,3 +130,28 @@ def test_a_bayer_order_that_contradicts_the_file_is_told(tmp_path):
     np.savez(tmp_path / "a.npz", counts=frames(), exposure_s=1.0, cfa="RGGB")
     with pytest.warns(UserWarning, match=r"cfa: .*a\.npz says RGGB; the given BGGR is used instead"):
         assert hsnoise.load(tmp_path / "a.npz", cfa="BGGR").cfa == "BGGR"
+
+
+@pytest.mark.parametrize(
+    ("about", "expected"),
+    [
+        ({"name": "no frames"}, "a.npz: expected an array 'counts', or 'arrays' in a.json with kind and exposure"),
+        ([], "a.npz: expected an array 'counts', or 'arrays' in a.json"),
+        ({"arrays": {"bias": {"kind": "bias"}}}, "a.npz: a.json describes 'bias': expected .* kind and exposure_s"),
+        ({"arrays": {"dark": {"kind": "dark", "exposure_s": 1}}}, "a.npz: a.json describes 'dark': expected an array"),
+        ({"arrays": {"bias": 3}}, "a.npz: a.json describes 'bias': expected"),
+    ],
+)
+def test_json_beside_an_npz_file_that_does_not_describe_it(tmp_path, about, expected):
+    np.savez(tmp_path / "a.npz", bias=frames())
+    (tmp_path / "a.json").write_text(json.dumps(about))
+    with pytest.raises(ValueError, match=expected):
+        hsnoise.load(tmp_path / "a.npz")
+
+
+def test_json_beside_an_npz_file_gives_kind_and_exposure(tmp_path):
+    np.savez(tmp_path / "a.npz", bias=frames(), dark=frames())
+    arrays = {"bias": {"kind": "bias", "exposure_s": 0.0}, "dark": {"kind": "dark", "exposure_s": 2.5}}
+    (tmp_path / "a.json").write_text(json.dumps({"arrays": arrays, "cfa": "RGGB"}))
+    stack = hsnoise.load(tmp_path / "a.npz")
+    assert list(stack.exposure_s) == [0.0, 2.5] and stack.cfa == "RGGB"

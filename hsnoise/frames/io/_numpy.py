@@ -40,10 +40,17 @@ def read(path: Path) -> list[Recording]:
 
 def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
     """Recordings of named arrays, described by the .json file beside them."""
-    about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    beside = path.with_suffix(".json")
+    about = json.loads(beside.read_text(encoding="utf-8"))
+    described = about.get("arrays") if isinstance(about, dict) else None
+    if not isinstance(described, dict) or not described:
+        raise ValueError(f"expected an array 'counts', or 'arrays' in {beside.name} with kind and exposure of each")
     found = []
-    for name, one in about["arrays"].items():
-        kind = str(one["kind"]).split()[0].lower()
+    for name, one in described.items():
+        missing = [key for key in ("kind", "exposure_s") if not isinstance(one, dict) or key not in one]
+        if name not in arrays or missing:
+            raise ValueError(f"{beside.name} describes {name!r}: expected an array of that name, kind and exposure_s")
+        kind = [*str(one["kind"]).split(), ""][0].lower()
         metadata: dict[str, Any] = {"exposure_s": float(one["exposure_s"]), "kind": "dark" if kind == "bias" else kind}
         if about.get("cfa"):
             metadata["cfa"] = about["cfa"].split()[0]
