@@ -22,7 +22,7 @@ from hsnoise.model import NoiseModel
 ROUNDS = 16
 STEPS = 60
 CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many standard errors
-# First guess of every coordinate's standard error: at most the first, and the second over the root of pixels.
+# First guess of a coordinate's standard error: the first, or the second over the root of pixels if that is less.
 FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
 MANY_ROWS, PILOT_ROWS = 30_000, 3_000
 FAR_OFF = 1e12  # loss where a step is not allowed to end

@@ -160,7 +160,7 @@ def _coarse(groups: tuple[GroupFacts, ...]) -> list[str]:
     said = []
     steps = {group.step_dn for group in groups}
     if len(steps) == 1 and max(steps) > 1:
-        said.append(f"All counts are multiples of {max(steps)}, apart from an offset: fewer bits were scaled up")
+        said.append(f"All counts are multiples of {max(steps)}, apart from an offset: scaled up from fewer bits")
     fine = [group for group in groups if group.kind == "dark" and group.temporal_dn < FEW_CODES]
     if fine:
         said.append(
