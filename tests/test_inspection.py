@@ -45,7 +45,7 @@ def test_the_gain_of_flats(rng):
     counts = [darks(rng, 0), *(flats(rng, mean) for mean in (300, 600, 1200, 2400))]
     found = hsnoise.inspect(FrameStack(counts, range(5), kind=["dark", *["flat"] * 4]))
     gain = float(found.determined[0].split("about ")[1].split()[0])
-    assert gain == pytest.approx(GAIN, rel=0.02) and "3 levels of flats" in found.determined[0]
+    assert gain == pytest.approx(GAIN, rel=0.02) and "3 levels of repeated flats" in found.determined[0]
 
 
 @pytest.mark.parametrize("electrons_per_dn, word", [(0.5, "agrees"), (3.0, "wrong or nominal")])
@@ -86,7 +86,7 @@ def copied(counts):
 
 def averaged(counts):
     counts[4] = counts.mean(0).round()
-    return r"has 0\.\d+ of the noise of the others: an average of frames"
+    return r"has 0\.\d+ times the noise of the others: an average of frames"
 
 
 @pytest.mark.parametrize("spoil", [lit, settling, drifting, copied, averaged])
@@ -177,7 +177,7 @@ def test_files_of_a_folder(night, capsys):
     assert [(group.kind, group.n_frames) for group in found.groups] == [("dark", 8), ("dark", 4), ("flat", 4)]
     said = "\n".join(found.findings)
     assert "Not usable: " in said and "calibrated.fits: counts must be >= 0" in said
-    assert "the files of the darks of 0 s are not named in order of time" in said
+    assert "The file names of the darks of 0 s are not in the order of the times in their headers" in said
     assert found.groups[1].temperature_c == -10 and "-10.0" in str(found)
     assert main(["inspect", str(night), "--debug"]) == 0
     printed = capsys.readouterr().out

@@ -33,7 +33,7 @@ def why_worse(step: Step, before: Step) -> Refusal | None:
 
 
 def is_there(effect: AbstractEffect, result: FitResult) -> bool:
-    """Whether some amplitude of the effect is beyond chance in a fit with it; if fits hold it, whether it is set.
+    """Whether an amplitude of the effect is beyond chance in a fit with it; if held in fits, whether it has an effect.
 
     For an effect that marks no amplitude, parameters with lower bound 0 and no upper bound count, or else those of
     either sign, or shares.

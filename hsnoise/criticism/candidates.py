@@ -1,4 +1,4 @@
-"""What may be missing: effects as they propose themselves for a capture.
+"""Effects that may be missing from a model, as they propose themselves for a capture.
 
 An amplitude of 1 is a modest effect; details that a user cannot know (period, corner, number of taps) vary from draw
 to draw, so that an effect is recognised whatever they are.
@@ -24,14 +24,14 @@ from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
-LINE_DRAWS = 6  # without lines of their own
-TINY_ERROR = 1e-9  # of statistics of which only draws show how they scatter
+LINE_DRAWS = 6  # of the model, which has no spectral lines of its own
+TINY_ERROR = 1e-9  # of statistics whose scatter only draws can show
 
-Suspect = AbstractEffect | type[AbstractEffect]  # what a user may offer
+Suspect = AbstractEffect | type[AbstractEffect]  # what a user may pass
 
 
 def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
-    """What effects ask of a capture, and of the model that was fitted to it, to propose themselves."""
+    """What effects need to know about a capture and its fitted model to propose themselves."""
     part = portion.frames
     darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
     exposures_s = {float(part.exposure_s[i]) for i in darks}
@@ -59,12 +59,12 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
 
 
 def built_in(facts: CaptureFacts) -> dict[str, Maker]:
-    """Effects that a capture can show and that the model does not have: name to maker from amplitude and generator."""
+    """Effects that a capture can show and the model lacks: name to maker, which takes amplitude and generator."""
     return proposed((effect for effect in EFFECTS if effect.name not in facts.effects), facts)
 
 
 def proposed(effects: Iterable[Suspect], facts: CaptureFacts) -> dict[str, Maker]:
-    """Makers by name: of classes as they propose themselves, if the capture can show them; of instances as `given`."""
+    """Makers by name: of classes as they propose themselves, if the capture can show them; of instances by `given`."""
     makers: dict[str, Maker] = {}
     for effect in effects:
         if isinstance(effect, AbstractEffect):
@@ -80,9 +80,9 @@ def can_be_proposed(effect: type[AbstractEffect]) -> bool:
 
 
 def given(effect: AbstractEffect) -> Maker:
-    """An effect that is ready: its amplitudes are scaled, less those that are held.
+    """The maker of an effect instance: it scales the amplitudes that are not held.
 
-    Of an effect that marks none, the parameters that may be 0 and have no upper bound, or else those that may be 0.
+    If the effect marks none, it scales parameters that may be 0 and have no upper bound, or else those that may be 0.
     """
     specs = effect.specs()
     may_be_zero = {name for name, spec in specs.items() if spec.low == 0}
@@ -104,7 +104,7 @@ def made(maker: Maker, amplitude: float, detail: int) -> AbstractEffect:
 
 
 def check_candidates(candidates: Any) -> tuple[Suspect, ...]:
-    """The candidates of a user. Raises TypeError unless they are effects, ValueError for two of one name."""
+    """The candidates of a user. Raises TypeError unless they are effects, ValueError for two with the same name."""
     if isinstance(candidates, AbstractEffect) or _is_effect_class(candidates):
         raise TypeError(f"candidates: expected a list of effects, got one effect, {candidates.name}")
     candidates = listed("candidates", candidates, "a list of effects")
@@ -130,9 +130,9 @@ def _is_effect_class(candidate: Any) -> bool:
 def check_makers(
     candidates: tuple[Suspect, ...], model: NoiseModel, like: FrameStack, facts: CaptureFacts
 ) -> dict[str, Maker]:
-    """Makers of a user's candidates, by name, less what the capture cannot show.
+    """Makers of a user's candidates, by name, without those that the capture cannot show.
 
-    Raises TypeError for a `propose` that gives no such effect, ValueError for draws that are no signal of a sensor.
+    Raises TypeError if `propose` makes another kind of effect, ValueError if its draws are not a sensor's signal.
     """
     makers = proposed(candidates, facts)
     for one in candidates:
@@ -153,9 +153,9 @@ def not_in(model: NoiseModel, candidates: tuple[Suspect, ...]) -> tuple[Suspect,
 
 
 def with_own_statistics(model: NoiseModel, candidates: Iterable[Suspect]) -> Callable[[FrameStack], Structure] | None:
-    """The statistics of a capture and those that effects of a user bring; None if none brings any.
+    """A function for the statistics of a capture and those that a user's effects define; None if none defines any.
 
-    A statistic is one of each dark exposure, in a group called after the effect.
+    These are measured for each dark exposure, in a group named after the effect.
     """
     own = [one for one in candidates if one.statistics.__func__ is not AbstractEffect.statistics.__func__]
     black = black_level_of(model)

@@ -25,7 +25,7 @@ WORST = 5
 class Unexplained:
     """What remains: the worst group's normal score, and the statistics that are far off, with their z.
 
-    Beyond what the diagnosis names, or what comes nearest if that explains half of it; else beyond the model.
+    With the named effects in the model, or the nearest ones if they explain half of the misfit; else with neither.
     """
 
     misfit: float
@@ -50,7 +50,7 @@ class Diagnosis:
         advice: the capture that would decide, or what to look at next.
         unexplained: what remains.
         nearest: if none explains the capture, the effects that explain most statistics, best first; `improve` tries
-            them. Scores of the ranking mean little there.
+            them. The scores of the ranking then mean little.
     """
 
     ranking: tuple[Candidate, ...]
@@ -104,7 +104,7 @@ class Diagnosis:
         return data_frame(self, ("effect", "score_nats", "p", "z_left"), rows)
 
     def as_table(self) -> Table:
-        """The leaders of the ranking, as they are printed."""
+        """The top of the ranking, as printed."""
         table = Table("effect", "score / nats", "p", "z left")
         for c in self.ranking[:WORST]:
             table.add_row(c.name, f"{c.score:z.1f}", c.chance, f"{c.misfit:z.1f}")
@@ -132,7 +132,7 @@ class Diagnosis:
 
     @property
     def remains(self) -> str:
-        """What is still off with what is named in the model, in a sentence; empty if nothing stands out."""
+        """A sentence on what is still off with the named effects in the model; empty if nothing stands out."""
         if not self.names or not self.unexplained.stands_out:
             return ""
         left = self.unexplained

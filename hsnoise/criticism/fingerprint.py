@@ -16,8 +16,8 @@ from hsnoise.simulation.simulator import Simulator
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
 SLOPE_DRAWS = 2
-STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many of them it may be off;
-FAR_REACH = 30.0  # of the row gain so many: rows that have another kind of noise give it to rows without any
+STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many such steps it may be off
+FAR_REACH = 30.0  # likewise, of the row gain: another kind of row noise can pass for a row gain where there is none
 BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
 
 
@@ -46,7 +46,7 @@ class Fingerprint:
 def distribution_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True) -> Gaussian:
     """Distribution of the statistics where an effect shifts them by one of `shifts` [detail, statistic].
 
-    of_details: their scatter is part of it.
+    of_details: whether the scatter over details is included.
     """
     mean = shifts.mean(0)
     covariance = null.covariance.copy()
@@ -59,7 +59,7 @@ def distribution_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True)
 
 @dataclass(frozen=True)
 class Bench:
-    """What every candidate is drawn on: the simulator of the model, and draws of the model itself."""
+    """The common base for drawing candidates: the simulator of the model, and draws of the model itself."""
 
     simulator: Simulator
     base: Reference
@@ -80,8 +80,8 @@ class Bench:
     def fingerprints(self, wanted: Mapping[str, tuple[Maker, tuple[float, ...]]], details: int) -> list[Fingerprint]:
         """Draw candidates, by name a maker and amplitudes, on top of the model; each amplitude with several details.
 
-        All are drawn in one go, details outermost, so that one effect is compiled while another is drawn, and none a
-        second time.
+        All are drawn in one go, details outermost, so that one effect is compiled while another is drawn, and none is
+        compiled twice.
         """
         tasks = [
             (name, amplitude, detail)
@@ -99,7 +99,7 @@ class Bench:
         ]
 
     def slopes(self) -> np.ndarray:
-        """Shifts that wrong base parameters could make [parameter, statistic]: what a refit would absorb."""
+        """Shifts that wrong base parameters could cause [parameter, statistic]: a refit would absorb them."""
         moved, reach = zip(*_moved_models(self.model), strict=True)
         steps = 1 / np.array(reach)
         return self.simulator.slopes(self.model, moved, steps, SLOPE_DRAWS).mean(0) / self.base.deviation
@@ -107,14 +107,14 @@ class Bench:
     def shifts(self, wanted: Sequence[tuple[NoiseModel, int]]) -> np.ndarray:
         """Statistics of draws of changed models, by model and number, less those of the model [draw, statistic].
 
-        Of the same random numbers, and in units of the base draws' deviation.
+        From the same random numbers, in units of the base draws' deviation.
         """
         numbers = [number for _, number in wanted]
         return (self.simulator.drawn(wanted) - self.base.draws[numbers]) / self.base.deviation
 
 
 def _moved_models(model: NoiseModel) -> list[tuple[NoiseModel, float]]:
-    """The model with one base parameter a little off, for each of them, and how many such steps it may be off."""
+    """For each base parameter: the model with it a little off, and how many such steps it may be off."""
     models = []
     for name, what in BASE.items():
         if name not in model:

@@ -72,9 +72,9 @@ def improve(
             FrameStack's keywords.
         model: where to start, such as the model of an interrupted story; default: all effects of the paper.
         candidates: effects of your own that may be added, too, classes or instances as `diagnose` takes them.
-        max_minutes: after which the story ends at the next draw, with the models that were kept until then (the first
-            fit is finished in any case); None: as long as it takes.
-        max_steps: additions at most, beside those that the first fit measured; None: MOST_STEPS.
+        max_minutes: after which the story ends at the next draw, with the models kept until then (the first fit is
+            always finished); None: as long as it takes.
+        max_steps: most additions, besides those that the first fit measured; None: MOST_STEPS.
         close: whether to close the last model with measured components (`Story.closed`), judged by the frames held out;
             it takes a minute or two more, whatever max_minutes says.
         seed: of all draws. progress: called with a sentence at each stage, "Step 1: adding row_noise; error 26.3", and
@@ -149,7 +149,7 @@ def improved(
 
 @dataclass(frozen=True)
 class _Work:
-    """What every step is made of.
+    """What every step needs.
 
     fitted: frames to fit, and the portion of them that is drawn; held_out: frames that no fit sees; tell: gets events;
     given: whether the user chose the effects of the first model.
@@ -169,7 +169,7 @@ class _Work:
         self.tell(event)
 
     def seeing(self, of: FitResult) -> _Work:
-        """Itself for steps of this fit: without flats if the gain is unknown."""
+        """The same work for steps of this fit: without flats if the gain is unknown."""
         if of.has_gain:
             return self
         return replace(self, portion=self.portion.without_flats("the gain is not determined, and flats need it"))
@@ -177,13 +177,13 @@ class _Work:
     def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
         """Diagnose the last step, and append one more; if there is none, how the story ends.
 
-        Raises TimeIsUp at the first draw after the limit: `steps` are as they were then, but for a diagnosis.
+        Raises TimeIsUp at the first draw after the limit; `steps` are then unchanged, except for a diagnosis.
         """
         last = steps[-1]
         tick = self.counter(_stage("looking for what is missing", steps))
         found = diagnosed(last.fit, self.portion, tuple(own), seed=self.seed, tick=tick)
         steps[-1] = last = replace(last, diagnosis=found)
-        # Where the first fit had no gain, they were followed from the start, if that was any better.
+        # If the first fit had no gain, pixels were followed from the start, if that was any better.
         if found.verdict == Verdict.UNEXPLAINED and last.fit.has_gain:
             followed = self.pixels_followed(steps)
             if followed is not None:
@@ -220,7 +220,7 @@ class _Work:
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
 
     def started(self, first: FitResult) -> list[Step]:
-        """The first steps of a fit, or where it has no gain, of one that follows each pixel if that comes nearer."""
+        """The first steps of a fit or, if it has no gain, of one that follows each pixel if that comes nearer."""
         seeing = self.seeing(first)
         steps = seeing.begun(first)
         followed = None if first.has_gain else seeing.pixels_followed(steps)
@@ -237,8 +237,8 @@ class _Work:
     def pixels_followed(self, steps: Sequence[Step]) -> FitResult | None:
         """A fit that follows each pixel, if it comes much nearer than the pooled pixels of the only step.
 
-        It measures what frames, rows and columns share, all at once, which no single effect explains. A gain that
-        nothing casts doubt on is not given up for it.
+        It measures what frames, rows and columns share, all at once, which no single effect explains. A gain
+        without doubts is not given up for it.
         """
         pooled, before = steps[-1].fit, steps[-1].comparison.error
         if len(steps) > 1 or self.given or pooled.method not in (Method.ML, Method.LINE):
@@ -256,7 +256,7 @@ class _Work:
         if judged is not self.portion:
             before = compared(pooled.params, judged, seed=self.seed).error
         after = compared(result.params, judged, seed=self.seed, tick=self.counter(stage, DRAWS)).error
-        # Without a gain, pooled pixels leave the size of every effect in e- open.
+        # Without a gain, pooled pixels leave the size of every effect in e- undetermined.
         if after > (rules.HALF if pooled.has_gain else 1.0) * before:
             self.say(Event(f"pixels stay pooled: following them leaves an error of {number(after)}"))
             return None
@@ -370,7 +370,7 @@ def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
 
 
 def _ending(found: Diagnosis, comparison: Comparison, refused: Mapping[str, Refusal] | None = None) -> Ending:
-    """How the story ends where no step follows; refused: what was tried for one, None if nothing was."""
+    """How the story ends where no step follows; refused: the candidates that were tried, None if none was."""
     as_chance = comparison.fits
     if refused is not None and as_chance:
         why = Ended.AS_CHANCE

@@ -281,7 +281,7 @@ def replaced(by_maps: Sequence[str], overshot: Sequence[str]) -> str:
     """Which named effects measured components stand for; empty if none."""
     said = []
     if by_maps:
-        said.append(f"Measured on this sensor instead of drawn for any of its make: {', '.join(by_maps)}.")
+        said.append(f"Measured on this sensor instead of drawn for any sensor of its make: {', '.join(by_maps)}.")
     if overshot:
         said.append(f"Measured whole, because the named effect does not match: {', '.join(overshot)}.")
     return " ".join(said)

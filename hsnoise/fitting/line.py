@@ -18,9 +18,9 @@ from hsnoise.lut import clipped_moments, row_moments, unclip
 from hsnoise.model import NoiseModel
 
 ROUNDS, TOLERANCE = 60, 1e-5  # of gain -> correction -> line -> gain
-LEAST_GAIN, MOST_GAIN = 0.02, 2.0  # of the gain that would make all variance shot noise
+LEAST_GAIN, MOST_GAIN = 0.02, 2.0  # relative to the gain at which all variance is shot noise
 LEAST_ROW_SIGMA, MOST_ROW_VARIANCE = 0.01, 1.0
-ABSENT = 1e-9  # weight of an exposure that a replicate does not have
+ABSENT = 1e-9  # weight of an exposure that a replicate leaves out
 SURPRISE = 4.0  # standard errors
 
 
@@ -29,9 +29,9 @@ class LineFit:
     """Parameters of the paper's model by its own procedure.
 
     Attributes:
-        params: values, finite also where nothing determines them.
-        standard_errors: by the names of `params.table`; infinite where undeterminable, 0 for what was given.
-        notes: sentences on what the numbers cannot say by themselves.
+        params: values, finite even if undetermined.
+        standard_errors: by name, as in `params.table`; infinite if undetermined, 0 if given.
+        notes: sentences that qualify the numbers.
     """
 
     params: NoiseModel
@@ -43,7 +43,7 @@ class _Points(NamedTuple):
     """Statistics of the rows of each exposure, flats after darks: [replicate, channel, point].
 
     level (DN), variance within rows, power of row means about their frame's mean (DN^2); the numbers of pixels and
-    rows they stand on. bands [replicate, channel, dark, band]: the power of the darks by row frequency.
+    rows behind them. bands [replicate, channel, dark, band]: the power of the darks by row frequency.
     """
 
     level: np.ndarray
@@ -55,7 +55,7 @@ class _Points(NamedTuple):
 
 
 class _Setting(NamedTuple):
-    """What replicates share: row_pixels [channel, point]; whether there is a line."""
+    """What all replicates share: row_pixels [channel, point]; whether the points span a line."""
 
     summary: Summary
     row_pixels: np.ndarray
@@ -65,8 +65,8 @@ class _Setting(NamedTuple):
 class _Correction(NamedTuple):
     """Normalised and corrected points [replicate, channel, point].
 
-    True mean (DN) and variance (DN^2) at a row gain of 1, weight of the point in the line, response (DN) of row means
-    to the row gain, the same squared noise of a row's gain, whether some distribution of the family has the pair.
+    True mean (DN) and variance (DN^2) at a row gain of 1, weight in the line fit, response (DN) of row means to the row
+    gain, noise variance of a row's measured gain, whether a distribution of the family has this mean and variance.
     """
 
     mean: np.ndarray
@@ -89,16 +89,16 @@ class _Estimate(NamedTuple):
 
 
 def line_fit(summary: Summary) -> LineFit:
-    """Fit the paper's model by the paper's procedure, made as fair as it can be.
+    """Fit the paper's model by the paper's procedure, improved where possible.
 
-    The gain of a row is its mean over its frame's mean; it is divided out, and mean E' and variance Var' of each
-    exposure and colour are corrected for clipping (the tables of `lut`, evaluated at the measured pairs themselves).
+    Each row is divided by its gain, its mean over its frame's mean. Mean E' and variance Var' of each exposure and
+    colour are corrected for clipping (the tables of `lut`, evaluated at the measured pairs themselves).
     The gain is the slope of Var' against E', the dark current E' / (gain t), the read-noise variance
-    Var' / gain^2 - E' / gain. The correction needs the gain: both are repeated until it settles (3 to 10 rounds).
+    Var' / gain^2 - E' / gain. The correction needs the gain, so the two alternate until it settles (3 to 10 rounds).
 
-    Beyond the paper: a row's gain is known only as well as its mean (`_mean_square_gain`), the spread of row means
-    is freed of their measurement noise, points are weighted, colours share dark current and read noise. Flats are
-    points of the line. Standard errors: jackknife over frames.
+    Beyond the paper: the error of a row's gain is that of its mean (`_mean_square_gain`), measurement noise is
+    subtracted from the spread of row means, points are weighted, and colours share dark current and read noise. Flats
+    are further points on the line. Standard errors: jackknife over frames.
 
     Bias, in percent of the true value, over 64 simulated captures (4 frames of 96 x 128 pixels at 0.02, 0.05, 0.1 and
     0.2 s; in brackets the spread of single captures; R, G, B):
@@ -109,11 +109,11 @@ def line_fit(summary: Summary) -> LineFit:
     | Canon, black 128 | -2.2, 0.1, 0.5 (8, 3, 4) | 0.1 (2) | 0.1 (2) | -1.3, -1.3, -0.2 (4, 5, 6) | -1.7 (4) |
     | Grasshopper, black 0 | -0.4, -0.1, 0.1 (2, 2, 2) | 0.1 (1) | 0.1 (2) | -0.2, -0.1, 0.2 (3, 2, 3) | |
 
-    The gain of a strongly fluctuating colour (red) is a little low, and its standard error, from as few frames, too
-    small by a fifth. Hot pixels and other outliers enter in full: sums of squares are not robust.
+    The gain of a strongly fluctuating colour (red) is slightly low, and its standard error from so few frames is too
+    small by a fifth. Hot pixels and other outliers count in full: sums of squares are not robust.
 
     Raises:
-        ValueError: if there are no darks, or not two rows and two pixels a row of each colour.
+        ValueError: if there are no darks, or a colour has fewer than two rows or two pixels per row.
     """
     if not summary.histograms:
         raise ValueError("summary: the line fit needs dark frames, got flats only")
@@ -136,9 +136,9 @@ def _frame_statistics(histograms: RowHistograms, sensor_rows: int, ddof: int):
 
 
 def _frame_weights(n_frames: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Weights [replicate, exposure, frame], all frames first, and what a replicate adds to the variance [replicate].
+    """Weights [replicate, exposure, frame], all frames first, and each replicate's factor in the variance [replicate].
 
-    Jackknife: each replicate lacks a frame. Where an exposure has one frame only, its whole point is left out.
+    Jackknife: each replicate leaves out one frame, or the whole point of an exposure with only one frame.
     """
     full = np.zeros((len(n_frames), max(n_frames)))
     for e, n in enumerate(n_frames):
@@ -179,7 +179,7 @@ def _replicates(summary: Summary) -> tuple[_Points, _Setting, np.ndarray]:
 
 
 def _with_flats(points: _Points, row_pixels, scale, flats):
-    """Append the flats as points; a replicate for each of their mean squares, moved by its standard error."""
+    """Append the flats as points, and a replicate for each of their mean squares, shifted by its standard error."""
     columns = [flats.mean_dn, flats.variance_dn2, flats.row_power_dn2, flats.dof, flats.row_dof]
     columns = [np.asarray(a, np.float64).T for a in columns]  # [channel, level]
     moved = [(field, i) for field in (1, 2) for i in np.ndindex(columns[0].shape)]
@@ -198,7 +198,7 @@ def _with_flats(points: _Points, row_pixels, scale, flats):
 
 
 def _straight_line(x, y, weight):
-    """Slope and value at 0 of the weighted line of y against x, over the last axis."""
+    """Slope and intercept of the weighted line of y against x, over the last axis."""
     weight = weight / weight.sum(-1, keepdims=True)
     x = np.broadcast_to(x, y.shape)
     centre = (weight * x).sum(-1)
@@ -208,9 +208,9 @@ def _straight_line(x, y, weight):
 
 
 def _black_level(points: _Points, summary: Summary) -> np.ndarray:
-    """As given, or the intercept of mean against exposure [replicate, channel].
+    """The black level as given, or the intercept of mean against exposure [replicate, channel].
 
-    Of a single exposure, which has no such line, a standard deviation below its mean, as a placeholder.
+    A single exposure has no such line: as a placeholder, one standard deviation below its mean.
     """
     darks = len(summary.exposure_s)
     level, weight = points.level[..., :darks], (points.pixels / points.variance)[..., :darks]
@@ -222,7 +222,7 @@ def _black_level(points: _Points, summary: Summary) -> np.ndarray:
 
 
 def _row_variance(power, noise, rows):
-    """Variance of the row gain from squared spreads of row means and their noise [..., point], best weights."""
+    """Variance of the row gain from squared spreads of row means and their noise [..., point], optimally weighted."""
     variance = np.full(power.shape[:-1], 0.01)
     for _ in range(20):
         weight = rows / (np.maximum(variance, 0.0)[..., None] + noise) ** 2
@@ -231,9 +231,9 @@ def _row_variance(power, noise, rows):
 
 
 def _mean_square_gain(power, noise, rows, variance):
-    """Mean square gain of a point's rows, as far as their means show it, and its relative variance.
+    """Mean square gain of a point's rows, estimated from their means, and its relative variance.
 
-    A row's gain given its mean is normal, between the measured one and 1; `share` of it is measured.
+    Given its mean, a row's gain is normal about a value between the measured gain (weight `share`) and 1.
     """
     variance = np.clip(variance, 0.0, MOST_ROW_VARIANCE)[..., None]
     share = variance / (variance + noise)
@@ -245,7 +245,7 @@ def _mean_square_gain(power, noise, rows, variance):
 def _correct(
     points: _Points, setting: _Setting, gain, black, before: _Correction | None
 ) -> tuple[_Correction, np.ndarray]:
-    """One round: rows normalised and clipping corrected with this gain; `before` is the round before, or None."""
+    """One round: rows normalised and clipping corrected with this gain; `before` is the previous round, or None."""
     camera = dict(gain=gain[..., None], black_level_dn=black[..., None], white_level_dn=setting.summary.white_level_dn)
     level, variance = points.level - black[..., None], points.variance
     least = 1e-2 * np.sqrt(variance)
@@ -257,7 +257,7 @@ def _correct(
     s = np.clip(row_variance, 0.0, MOST_ROW_VARIANCE)[..., None]
     unit = variance / mean_square
     if before is not None:
-        # Rows of other gains are clipped otherwise, unless black is the clipping level or far above it.
+        # Rows of different gain are clipped differently, unless black is the clipping level or far above it.
         sigma = np.sqrt(np.maximum(s, LEAST_ROW_SIGMA**2))
         level_one, variance_one = map(np.asarray, clipped_moments(before.mean, before.variance, **camera))
         rows = map(np.asarray, row_moments(before.mean, before.variance, sigma, **camera))
@@ -269,7 +269,7 @@ def _correct(
     relative = 2 / points.pixels * (1 + 6 * s + 3 * s**2) / (1 + s) ** 2 + scatter
     error = np.sqrt(relative)
     found = solved | (
-        (true_variance != unit)  # else the pair itself came back
+        (true_variance != unit)  # otherwise `unclip` returned the pair unchanged
         & (mean > -SURPRISE * error * true_variance / np.sqrt(unit))
         & (true_variance - gain[..., None] * mean > -SURPRISE * error * true_variance**2 / unit)
     )
@@ -302,7 +302,7 @@ def _estimate(points: _Points, setting: _Setting) -> tuple[_Estimate, _Correctio
     weight = (points.pixels / correction.variance)[..., :darks] + 1e-300
     dark_current = (weight * t * electrons[..., :darks]).sum(-1) / np.maximum((weight * t * t).sum(-1), 1e-300)
     read_variance = (correction.weight * (square - electrons)).sum(-1) / correction.weight.sum(-1)
-    # Both inherit the error of the gain: colours count by how well they determine it.
+    # Both inherit the error of the gain: colours are weighted by how well they determine it.
     centre = (correction.weight * electrons).sum(-1, keepdims=True) / correction.weight.sum(-1, keepdims=True)
     trust = gain**4 * (correction.weight * (electrons - centre) ** 2).sum(-1) + 1e-12
     trust = trust / trust.sum(-1, keepdims=True)
@@ -386,14 +386,14 @@ def _notes(value, setting, correction, has_gain, has_black, has_errors, step) ->
         (not summary.exposure_s.any(), "The dark current is not determined: all darks are bias frames of 0 s."),
         (value.dark_current < 0, "The mean of the darks falls with exposure: the dark current is set to 0."),
         (value.read_variance <= 0, "The variance is not above shot noise: the read noise is set to 0."),
-        (step.max() > 100 * TOLERANCE, f"Gain and clip correction do not settle: the gain moves by {step.max():.1%}."),
+        (step.max() > 100 * TOLERANCE, f"Gain and clip correction do not converge: gain moves by {step.max():.1%}."),
     )
     notes = [sentence for holds, sentence in cases if holds]
     exposures = [f"{t:g} s" for t in summary.exposure_s] + ["a flat"] * (correction.found.shape[-1] - darks)
     outside = [f"{names[c]} at {exposures[e]}" for c, e in np.argwhere(~correction.found[0])]
     if outside:
         notes.append(
-            f"No Poisson and normal noise has the clipped mean and variance of {', '.join(outside)}: the mean is below"
+            f"No Poisson plus normal noise has the clipped mean and variance of {', '.join(outside)}: the mean is below"
             " black, or the variance below shot noise; the correction for clipping is not reliable there."
         )
     return tuple(notes)

@@ -22,21 +22,21 @@ from hsnoise.model import NoiseModel
 ROUNDS = 16
 STEPS = 60
 CLOSE_SIGMA = 0.03  # converged: the next Newton step is shorter than this many standard errors
-# Taken for a standard error of every coordinate before one is known: at most this, and this over the root of pixels.
+# First guess of a coordinate's standard error: the first, or the second over the root of pixels if that is less.
 FIRST_SPREAD, FIRST_SPREAD_OF_ONE = 0.03, 33.0
 MANY_ROWS, PILOT_ROWS = 30_000, 3_000
-FAR_OFF = 1e12  # loss where a step must not end
+FAR_OFF = 1e12  # loss where a step is not allowed to end
 CHORDS = 12
-CHORD_CLOSE_SIGMA = 0.1  # with the curvature of a part of the frames
+CHORD_CLOSE_SIGMA = 0.1  # likewise, with the curvature of only part of the frames
 DIFFERENCE_SIGMA = 0.1  # step of the derivative of the gradient
 REFINEMENTS = 4  # of the curvature
 IDLE_BELOW = -3.0  # softplus coordinate: less than 5 % of what the data resolve
-TURNS = 3  # of rounds: two more after parameters left their bound
-OFF_BOUND, WORTH_NATS = 0.0, 0.5  # softplus coordinate: 0.7 of what the data resolve; likelihood gained there
+TURNS = 3  # of rounds: two more if parameters leave their bound
+OFF_BOUND, WORTH_NATS = 0.0, 0.5  # softplus coordinate (0.7 of what the data resolve); log-likelihood to gain there
 
 
 class Maximum(NamedTuple):
-    """Where a fit ended: parameters, information in them (inverse covariance), and how it went.
+    """The end of a fit: parameters, their information (inverse covariance), and how the search went.
 
     `values` are those of the free numbers in `model` and `outliers`, `vector` the same in coordinates, and `whiten` a
     square root of their covariance.
@@ -62,7 +62,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     """
     if _n_rows(summary) < 2 * MANY_ROWS:
         return _by_rounds(coordinates, summary)
-    give_back_free_memory()  # here and where compiling is done: the fit stays within 1 GiB by it
+    give_back_free_memory()  # here and after compiling: keeps the fit within 1 GiB
     frames = max(1, int(max(summary.n_frames) * MANY_ROWS / _n_rows(summary)))
     few, thinning = some_frames(summary, 0, frames), 1
     coarsest = max(h.row_stride for h in summary.histograms)
@@ -74,7 +74,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
     vector, whiten, iterations = pilot.vector, pilot.whiten / np.sqrt(thinning), pilot.iterations
     for turn in range(TURNS):
         darks, flats = _pieces(coordinates, vector, summary, frames)
-        # Rows inform about their neighbours' gains: all rows know more than the thinned ones scaled up.
+        # Rows carry information on their neighbours' gains: all rows tell more than the thinned ones scaled up.
         guide = partial(_gradients_of_pieces, coordinates, [*darks[: len(summary.channels)], *flats], 1 / scale)
         _, _, whiten = _curvature(coordinates, vector, whiten, guide)
         if turn == 0:
@@ -85,7 +85,7 @@ def maximise(coordinates: Coordinates, summary: Summary) -> Maximum:
         iterations += steps
         if distance < CHORD_CLOSE_SIGMA:
             break
-        vector = ahead  # too far for one curvature: another from here
+        vector = ahead  # too far for one curvature: measure it again here
 
     def anew(point):
         parts = _pieces(coordinates, point, few, frames)
@@ -101,9 +101,9 @@ def _n_rows(summary: Summary) -> int:
 
 
 def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
-    """Rounds of quasi-Newton steps, each from a fresh curvature and with fresh quadrature rules.
+    """Rounds of quasi-Newton steps, each with a fresh curvature and fresh quadrature rules.
 
-    Once more where a parameter was left at its bound of zero without need.
+    Repeated if a parameter ended at its bound of zero although the likelihood is higher above it.
     """
     light = _on_device(without_counts(summary))
     vector = np.asarray(eqx.filter_jit(Coordinates.start)(coordinates))
@@ -126,7 +126,7 @@ def _by_rounds(coordinates: Coordinates, summary: Summary) -> Maximum:
 
 
 def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, rules):
-    """From `vector` to where the likelihood rises no more: (vector, value, whitening, rules, steps, errors left)."""
+    """From `vector` until the likelihood stops rising: (vector, value, whitening, rules, steps, errors left)."""
     pixels = sum(h.counts.sum(dtype=np.float64) for h in summary.histograms) + 1.0
     whiten = min(FIRST_SPREAD, FIRST_SPREAD_OF_ONE / np.sqrt(pixels)) * np.eye(len(vector))
     value, _, whiten = _curvature(coordinates, vector, whiten, partial(_gradients, coordinates, light, rules))
@@ -139,7 +139,7 @@ def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, 
             break
         rules = _on_device(replan(rules, rules_at(coordinates, ahead, summary)))
         value, gradient, whiten = _curvature(coordinates, ahead, whiten, partial(_gradients, coordinates, light, rules))
-        # Length in standard errors of the Newton step that is left.
+        # Length of the remaining Newton step in standard errors.
         distance = float(np.linalg.norm(whiten.T @ gradient)) if np.isfinite(value) else np.inf
         if not np.isfinite(distance):
             break
@@ -152,7 +152,7 @@ def _rounds(coordinates: Coordinates, vector, summary: Summary, light: Summary, 
 def _off_bounds(coordinates, vector, value, gradient_anew) -> np.ndarray:
     """`vector`, with parameters taken off their bound where the likelihood is higher above it.
 
-    At the bound it is flat in their coordinates, whether it rises beyond or not: a search that once got there stays.
+    At the bound it is flat in their coordinates, even if it rises above, so a search that gets there stays there.
     """
     ahead = np.array(vector)
     for i in np.flatnonzero(_idle(coordinates, vector)):
@@ -167,9 +167,9 @@ def _on_device(tree):
 
 
 def _pieces(coordinates: Coordinates, vector, summary: Summary, frames: int) -> tuple[list[tuple[Summary, Rules]], ...]:
-    """The likelihood in pieces that add up, those of darks and of flats: (summary, rules) for each.
+    """The likelihood as a sum of pieces, of darks and of flats: (summary, rules) for each.
 
-    A piece of the darks is `frames` frames of one channel, all of one shape, so that memory and compilation are
+    A piece of the darks is `frames` frames of one channel. All have the same shape, so memory and compilation are
     those of one piece; the channels of the first frames come first.
     """
     channels = range(len(summary.channels))
@@ -177,7 +177,7 @@ def _pieces(coordinates: Coordinates, vector, summary: Summary, frames: int) -> 
     parts = (some_frames(summary, start, start + frames) for start in range(0, max(summary.n_frames), frames))
     plan = partial(rules_at, coordinates, vector, margin=CLOSE_MARGIN)
     rules = [[plan(part, channel=c) for c in channels] for part in parts]
-    # Channels of one stride share a program, too.
+    # Channels of the same stride also share a program.
     strides = [h.row_stride for h in summary.histograms]
     most = {
         stride: reduce(
@@ -206,7 +206,7 @@ def _gradients_of_pieces(coordinates: Coordinates, pieces, flats_weight: float, 
 def _chords(vector, whiten, gradients):
     """Newton steps with the curvature in `whiten`: (vector, value, standard errors left, steps).
 
-    A step that leads down, and farther away, is tried again at a quarter of its length.
+    A step that lowers the likelihood and ends farther away is retried at a quarter of its length.
     """
     best, ahead, length, steps = (vector, -np.inf, np.inf), vector, 1.0, 0
     while True:
@@ -225,10 +225,10 @@ def _chords(vector, whiten, gradients):
 def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
     """BFGS in coordinates whose unit is about one standard error, so that its first step is Newton's: (vector, steps).
 
-    It moves in the space that the columns of `whiten` span, less than `reach` from `vector`. The gradient is that of
-    `gradient_at`, compiled once for all that needs it; only the step of the solver is a program of its own.
+    It moves in the span of the columns of `whiten`, less than `reach` from `vector`. The gradient is that of
+    `gradient_at`, compiled once for all callers; only the solver's step is compiled separately.
     """
-    import optimistix as optx  # a seventh of the time that `import hsnoise` would take
+    import optimistix as optx  # at the top, it would take a seventh of `import hsnoise`
 
     solver = optx.BFGS(rtol=0.0, atol=1e-2, norm=optx.max_norm)
     y = jnp.zeros(whiten.shape[1])
@@ -236,7 +236,7 @@ def quasi_newton(coordinates, vector, whiten, reach, reference, summary, rules):
     while not done and steps < STEPS:
         ahead = vector + whiten @ state.y_eval
         told = FAR_OFF, jnp.zeros_like(y)
-        if (np.abs(ahead - vector) < reach).all():  # most steps of a search that comes to this fence lie beyond it
+        if (np.abs(ahead - vector) < reach).all():  # once a search reaches this limit, most steps lie beyond it
             value, gradient = gradient_at(coordinates, ahead, summary, rules)
             if np.isfinite(value):
                 told = reference - value, -(whiten.T @ gradient)
@@ -264,21 +264,21 @@ def _step(solver, y, told, state):
 
 
 def _gradients(coordinates, summary, rules, points):
-    """Values and gradients at `points`, one after the other."""
+    """Values and gradients at `points`, one at a time."""
     found = [gradient_at(coordinates, point, summary, rules) for point in jnp.asarray(points)]
     values, gradients = zip(*found, strict=True)
     return np.asarray(values), np.asarray(gradients)
 
 
 def _curvature(coordinates, vector, whiten, gradients_at):
-    """Value, gradient and whitening W at `vector`, W W' the inverse of minus the Hessian.
+    """Value, gradient and whitening W at `vector`, where W W' is the inverse of the negative Hessian.
 
-    The Hessian comes from differences of exact gradients along the columns of an earlier W: there all directions curve
-    alike, and one that is a thousand times better known than another does not drown it. Repeated where the earlier W
-    was too far off.
+    The Hessian comes from differences of exact gradients along the columns of an earlier W. There all directions have
+    similar curvature, so one that is a thousand times better known than another does not swamp it. Repeated if the
+    earlier W was too far off.
     """
     active = ~_idle(coordinates, vector)
-    # Idle coordinates, where nothing changes, keep the unit and stay out of it.
+    # Idle coordinates, along which nothing changes, are left out and keep their unit.
     inner = _root((whiten @ whiten.T)[np.ix_(active, active)])
     whole = np.eye(len(vector))
     for _ in range(REFINEMENTS):
@@ -316,8 +316,8 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
     """Information on the parameters themselves, from the whitening of the coordinates.
 
     A parameter at a bound (no dark current, no row gain, a white share of 0 or 1) has a coordinate far out where
-    nothing changes; its row is measured between two values off the bound within what the data resolve. `gradient_anew`
-    plans the rules for a point: the nodes for rows without gain all lie at 1.
+    nothing changes; its row is measured between two values off the bound, within what the data resolve. `gradient_anew`
+    plans the rules at each point, because the nodes for rows without gain all lie at 1.
     """
     slope = np.asarray(parameters_at(coordinates, vector)[2])
     active = ~_idle(coordinates, vector)
@@ -336,7 +336,7 @@ def _in_parameters(coordinates, vector, whiten, gradient_anew) -> np.ndarray:
             row[i] = low[i] ** 2  # falls from the bound like an exponential distribution, whose deviation is 1 / slope
         alone = np.where(np.arange(len(row)) == i, row, 0.0)
         coupled = np.where(np.isin(np.arange(len(row)), at_bound), alone, row)
-        # Measured over a range, the couplings may contradict the rest: then they are left out.
+        # The couplings are measured over a range and may contradict the rest: then they are left out.
         for chosen in (coupled, alone):
             information[i], information[:, i] = chosen, chosen
             if _is_positive(information, [j for j in range(len(row)) if j == i or j not in at_bound]):

@@ -15,7 +15,7 @@ from hsnoise.likelihood.darks import black_level
 from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import RowHistograms
 
-UNDETERMINED = 0.3  # relative standard error from which a parameter is called undetermined
+UNDETERMINED = 0.3  # relative standard error above which a parameter is reported as undetermined
 LEAST_OUTLIERS = 5  # pixels; fewer may be chance
 MISPLACED_FRACTION = 0.03
 LIGHT_E_PER_S = 2e4  # a dark current above this looks like light

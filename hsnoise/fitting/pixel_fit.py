@@ -1,8 +1,8 @@
-"""A fit of darks whose pixels differ: gain by pixel transfer, the rest by the components that carry it.
+"""A fit of darks whose pixels differ: gain by pixel transfer, the rest from the noise components.
 
-Everything is conditional on the pixel: what stays in a pixel is no noise. The gain comes from how a pixel's variance
-over time grows with its level, or from flats where there are any; read noise from the variance that is there without
-signal; row gain from the rows' own component; and the population of pixels becomes the effects that draw it. See
+Everything is conditional on the pixel: what is constant in a pixel is not noise. The gain comes from the growth of a
+pixel's temporal variance with its level, or from flats if there are any; read noise from the variance without signal;
+row gain from the row component; and the population of pixels is described by the effects that draw it. See
 docs/likelihood.md.
 """
 
@@ -34,34 +34,34 @@ PATTERNS = {
     "row_x_frame": "row_noise",
     "column_x_frame": "column_noise",
 }
-DETERMINED = 0.25  # relative standard error up to which a gain is a number
-MOST_READ_NOISE_E = 300.0  # a gain that makes it more comes from pedestals that jump as if a signal grew
+DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
+MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
 ROW_GAIN_THERE = 3.0
-TOGETHER = 6.0  # deviations by chance from which rows are not white
-LEAST_EXPONENT_ERROR = 0.01  # no spectrum is a power law
+TOGETHER = 6.0  # chance deviations above which rows are not white
+LEAST_EXPONENT_ERROR = 0.01  # no spectrum is exactly a power law
 ROUNDS = 30
-MOST_SATURATED = 0.01  # share of the pixels of a flat that reach the highest count of all
-UNKNOWN = 1e6  # relative error of what is not known
+MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
+UNKNOWN = 1e6  # relative error of an unknown value
 
 
 @dataclass(frozen=True)
 class Channel:
-    """What the darks (and flats) say of one colour, in DN.
+    """What the darks (and flats) say about one colour, in DN.
 
     Attributes:
-        name; transfer, population: None where exposures do not differ.
-        values, covariance: gain (DN/e-), variance without signal (DN^2, rounding included), growth (DN/s); what is not
-            known has an error of UNKNOWN.
+        name; transfer, population: None if all exposures are equal.
+        values, covariance: gain (DN/e-), variance without signal (DN^2, rounding included), growth (DN/s); unknown
+            values have an error of UNKNOWN.
         black_dn: level without signal and its error.
-        row_gain: variance of the gain of rows and its error.
-        patterns: effect to the variance of what whole frames, rows and columns share without signal, DN^2, its standard
-            error, and its deviation by chance where there is none.
+        row_gain: variance of the row gain and its error.
+        patterns: by effect, the variance that whole frames, rows or columns share without signal, DN^2, its standard
+            error, and its chance deviation if there is none.
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
-        row_exponent: of the spectrum of what rows share, with its error; 0 where they are white.
+        row_exponent: of the spectrum of what rows share, with its error; 0 if they are white.
         noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
-        photo_response: standard deviation over pixels of the response to light, relative, with its error.
-        warm: the warm pixels in darks of one exposure; else None.
+        photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
+        warm: the warm pixels, if the darks have one exposure; else None.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Channel:
 class PixelFit:
     """The channels, the gain of the flats if there are any, and the joint estimate with its covariance.
 
-    estimate: gain [channel], read noise (e-), dark current (e-/s); `determined` [channel] whether its gain is.
+    estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
     channels: tuple[Channel, ...]
@@ -122,14 +122,14 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         population = _population(found, c, pixels, transfer)
         values[2] = population.mean
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
-            # Where ordinary pixels do not grow, hot ones give a bound only.
+            # If ordinary pixels do not grow, hot ones only give a bound.
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
     rows, shading = _row_gain(found, c, values[2]), _shadings(found, c)
     patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
-    if warm is not None:  # many warm pixels move the median of all: what is not theirs is black
+    if warm is not None:  # many warm pixels shift the median: black is the mean without their charge
         share, extra = warm.fraction[0], warm.extra_dn[0]
         black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
     return Channel(
@@ -154,7 +154,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
 def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
     """Exponent of what rows share in a frame, from the covariance of neighbouring rows of a plane, and its error.
 
-    0 for white rows; an infinite error also where rows are redder or bluer than any exponent makes them.
+    0 for white rows. The error is infinite for these, and if rows are redder or bluer than any exponent allows.
     """
     planes = _shortest(found, c)
     if not planes:
@@ -179,7 +179,7 @@ def _warm(found: Survey, c: int) -> Warm | None:
 
 
 def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
-    """Pixel transfer; what a gain of rows adds to pixels that are brighter than their row is taken off before."""
+    """Pixel transfer, after subtracting the variance that row gain adds to pixels brighter than their row."""
     classes = classes_of(pixels, found.full_scale_dn)
     variance, error = row_gain
     if variance > ROW_GAIN_THERE * error:
@@ -198,9 +198,10 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
 
 
 def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) -> tuple[float, float]:
-    """Standard deviation of the response of pixels to light, relative (PRNU), and its error, from 2 x 2 blocks.
+    """Relative standard deviation of the pixels' response to light (PRNU), and its error, from 2 x 2 blocks.
 
-    Of the flats that do not saturate; what dust and vignetting do to a block is small. An infinite error without any.
+    From the flats that do not saturate; dust and vignetting hardly vary within a block. Without any, the error is
+    infinite.
     """
     several = []
     for group in found.groups:
@@ -216,21 +217,21 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
 
 
 def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values with these errors, each weighted by its information, and its error."""
+    """Mean of values with these errors, weighted by their inverse variances, and its error."""
     values, errors = np.array(pairs, float).T
     weight = errors**-2
     return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
-    """What pixels differ by at the shortest exposure [half, block], and their deviation on the low side, DN."""
+    """Pixel differences at the shortest exposure [half, block], and the pixels' low-side standard deviation, DN."""
     planes, rows = _shortest(found, c), len(found.sampled_rows) * plane_rows(found)
     low_side = float(np.mean([low_side_sigma(plane.halves.level_dn, rows) for plane in planes]))
     return _blocks(found, planes), low_side
 
 
 def _blocks(found: Survey, planes: list[Plane]) -> np.ndarray:
-    """What pixels of 2 x 2 blocks differ by [half, block], DN."""
+    """Pixel differences within 2 x 2 blocks [half, block], DN."""
     rows = len(found.sampled_rows) * plane_rows(found)
     return np.concatenate([double_differences(plane.halves.level_dn, rows) for plane in planes], axis=1)
 
@@ -252,7 +253,7 @@ def _shadings(found: Survey, c: int) -> dict[str, Shading]:
 
 
 def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
-    """What frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
     planes, out = _shortest(found, c), {}
     if not planes:
         return out
@@ -269,14 +270,14 @@ def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
 
 
 def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
-    """Variance with rounding that stands for narrow noise, and its error: the bound is two of them away."""
+    """Variance of narrow noise, rounding included, and its error: the bound is two errors away."""
     estimate, bound = narrow
     middle = estimate if np.isfinite(estimate) else bound / 2
     return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
 def _temporal(found: Survey, c: int) -> tuple[float, float]:
-    """Temporal variance of the pixels at the shortest exposure, DN^2, outliers set apart, and its standard error."""
+    """Temporal variance of the pixels at the shortest exposure, DN^2, without outliers, and its standard error."""
     group = found.shortest
     if group is None:
         return 0.0, UNKNOWN
@@ -309,7 +310,7 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
     left = (level - theta[0] - theta[1] * t) / error
     covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
     slope_error = float(np.sqrt(covariance[1, 1]))
-    # Pixels differ in growth, so that the median's is no straight line: back to 0 s from the shortest exposure.
+    # Pixels differ in growth, so the median does not grow linearly: extrapolate to 0 s from the shortest exposure.
     shortest = int(t.argmin())
     black = float(level[shortest] - theta[1] * t[shortest])
     return (float(theta[1]), slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
@@ -317,7 +318,7 @@ def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[
 
 def _level(plane: Plane) -> float:
     """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
-    if plane.narrow_dn is not None:  # most pixels hold one count, and the median is that
+    if plane.narrow_dn is not None:  # most pixels have the same count, which is the median
         return float(plane.row_mean_dn.mean())
     return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 
@@ -330,7 +331,7 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Po
 
 
 def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
-    """Variance of the gain of rows: how the variance of row means grows with the square of the signal; its error."""
+    """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error."""
     groups = found.repeated_darks
     signal = growth * np.array([g.exposure_s for g in groups])
     parts = [[p.components["row_x_frame"] for p in g.of(c)] for g in groups]
@@ -346,7 +347,7 @@ def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
-    """The channel with the gain, and the gain of rows, that its flats give; those of its darks are left for a check."""
+    """The channel with the gain and row gain of its flats; the transfer of its darks remains as a check."""
     values, covariance = one.values.copy(), one.covariance.copy()
     values[0] = flats.gain[c]
     covariance[0], covariance[:, 0] = 0.0, 0.0
@@ -380,7 +381,7 @@ def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_rows(one: Channel) -> np.ndarray:
-    """Gain, variance without signal less rounding, growth; what the gain of rows adds to variances taken off."""
+    """Gain, variance without signal less rounding, and growth, without what row gain adds to variances."""
     widened = 1 + (one.row_gain[0] if one.row_gain[0] > ROW_GAIN_THERE * one.row_gain[1] else 0.0)
     return np.array([one.values[0] / widened, (one.values[1] - ROUNDING) / widened, one.values[2]])
 

@@ -33,9 +33,9 @@ from hsnoise.statistics.pixels.population import Population
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.transfer import ROUNDING
 
-NOMINAL = 50.0  # relative deviation of a gain of which nothing is known
-FANO_SIGMAS = 3.0  # standard errors below 1 from which hot pixels are below Poisson
-THERE = 5.0  # standard errors from which an effect of the population is in the model
+NOMINAL = 50.0  # relative standard error of an unknown gain
+FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
+THERE = 5.0  # standard errors above which a population effect enters the model
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
 OF_PIXELS = (
@@ -54,7 +54,7 @@ OF_PIXELS = (
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
-PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # deviations by chance, share of the temporal variance
+PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # chance deviations, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
 
@@ -121,7 +121,7 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
 
 
 def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
-    """Effects of the population that are there: name to field to (value, error), means over the colours."""
+    """The significant population effects: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     drift = _shading(pixel)
     if drift is not None:
@@ -161,7 +161,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
 
 
 def _hot(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels, where most colours have them beyond chance: means over those colours."""
+    """Hot pixels, if most colours have more than by chance: means over those colours."""
     hot = [(p, g) for p, g in many if p.hot_fraction[0] > 0 and p.hot_rate[0] > 0]
     if 2 * len(hot) <= len(many):
         return {}
@@ -178,7 +178,7 @@ def _hot(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dic
 
 
 def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels as darks of one exposure show them: charge of the exposure, or of the readout if that is zero."""
+    """Hot pixels from darks of one exposure: charge of the exposure, or of the readout if the exposure is zero."""
     many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
     if not many:
         return {}
@@ -198,7 +198,7 @@ def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
 
 
 def _fano(pixel: PixelFit) -> tuple[float, float] | None:
-    """Fano factor of the hot pixels, where it is below 1 beyond chance; flats give it better than ordinary pixels."""
+    """Fano factor of the hot pixels, if significantly below 1; flats give it more precisely than ordinary pixels."""
     told = []
     for c, channel in enumerate(pixel.channels):
         t = channel.transfer
@@ -236,7 +236,7 @@ def _black(pixel: PixelFit, summary: Summary) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviation of the gain of rows [channel] and its error; 0 where it is not beyond chance."""
+    """Standard deviation of the row gain [channel] and its error; 0 if it is within chance."""
     sigma, error = [], []
     for c in pixel.channels:
         variance, of = c.row_gain
@@ -247,7 +247,7 @@ def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: PixelFit) -> NoiseModel:
-    """The effects that are wanted, of the paper's model and of the population."""
+    """The wanted effects, from the paper's model and the population."""
     effects: list[AbstractEffect] = [paper[name] for name in wanted if name in paper]
     classes: dict[str, Any] = {cls.name: cls for cls in OF_PIXELS}
     for name in wanted:
@@ -278,7 +278,7 @@ def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:
 def _covariance(
     pixel: PixelFit, params: NoiseModel, population, black_error: np.ndarray, row_error: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names that were fitted and their covariance: gain, read noise, dark current together, others by themselves."""
+    """Fitted names and their covariance: gain, read noise and dark current jointly, the others independently."""
     numbers = numbers_of(params)
     joint = [n.name for place in IN_ELECTRONS for n in numbers if n.place == place]
     apart: dict[tuple[str, str], Any] = {("row_gain", "sigma"): row_error}

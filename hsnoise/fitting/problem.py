@@ -1,4 +1,4 @@
-"""What a refit by simulation moves, and what it looks at: coordinates of all numbers, score and structure."""
+"""What a refit by simulation varies and compares: coordinates of all numbers, score and structure."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from hsnoise.simulation.portion import Portion
 from hsnoise.statistics.structure import Structure, structure
 
 PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the data do not determine in place
-MOST_SPREAD = 0.25  # variance of base parameters, of themselves, from which they are unknown
-LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # of the logarithm of an effect's parameter; for base parameters half of it
-UNKNOWN = 100.0  # deviation of what the base fit does not know, in sizes
-SCORE_ERROR = 0.3  # at least, of the score in whitened units, whose deviation is 1 where the base fit is right
+MOST_SPREAD = 0.25  # variance of base parameters, relative to their size, above which they are unknown
+LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # in the logarithm of an effect's parameter; in sizes of a base parameter
+UNKNOWN = 100.0  # standard error, in sizes, of what the base fit does not know
+SCORE_ERROR = 0.3  # least error of the score in whitened units, whose deviation is 1 if the base fit is right
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A capture, its base fit, and the numbers to be found: y = (base in whitened units, effects unconstrained).
+    """A capture, its base fit, and the unknowns: y = (base in whitened units, effects unconstrained).
 
-    given: the model that was handed over; its base parameters are another place to start.
+    given: the model that the caller passed; its base parameters are a second starting point.
     """
 
     portion: Portion
@@ -42,7 +42,7 @@ class Problem:
 
     @cached_property
     def coordinates(self) -> Coordinates:
-        """Those of the base fit, without shares of outliers: its likelihood gives the score."""
+        """Coordinates of the base fit, without shares of outliers: its likelihood gives the score."""
         with jax.enable_x64(True):
             return coordinates_for(self.base.summary, self.base.params)
 
@@ -58,7 +58,7 @@ class Problem:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """What a change of each base coordinate is measured by: as much as doubles the parameter, say."""
+        """Unit for changes of each base coordinate: for example, the change that doubles the parameter."""
         with jax.enable_x64(True):
             return self.coordinates.sizes(self.centre)
 
@@ -70,7 +70,7 @@ class Problem:
         covariance[unknown], covariance[:, unknown] = 0.0, 0.0
         covariance[unknown, unknown] = (UNKNOWN * slope[unknown]) ** 2
         covariance = covariance / slope[:, None] / slope[None, :]
-        # Beside a deviation of millions, one of thousandths would have no digits.
+        # Next to a deviation of millions, one of thousandths would lose all its digits.
         share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
         return np.linalg.eigh(covariance * share[:, None] * share[None, :])
 
@@ -85,13 +85,13 @@ class Problem:
 
     @cached_property
     def whiten(self) -> np.ndarray:
-        """Square root of the covariance of the base coordinates, directions without information cut to MOST_SPREAD."""
+        """Square root of the covariance of the base coordinates, capped at MOST_SPREAD in directions without data."""
         values, vectors = self.spread
         return self.sizes[:, None] * vectors * np.sqrt(np.clip(values, 1e-16, MOST_SPREAD))
 
     @cached_property
     def prior(self) -> np.ndarray:
-        """Inverse variances that keep numbers near the start: of effects, and where the base fit knew nothing."""
+        """Inverse prior variances that keep numbers near the start: of effects, and of what the base fit left open."""
         base = np.where(self.spread[0] < MOST_SPREAD, 1e-6, 1.0)
         return np.concatenate([base, np.full(len(self.added.numbers), PRIOR_SIGMA**-2)])
 
@@ -106,7 +106,7 @@ class Problem:
 
     @cached_property
     def score(self) -> Score:
-        """Of the base likelihood at the base fit."""
+        """Score of the base likelihood at the base fit."""
         return Score.of(self.coordinates, self.centre, summarise(self.portion.frames, coding=self.coding))
 
     @cached_property
@@ -115,7 +115,7 @@ class Problem:
 
     @cached_property
     def other_start(self) -> np.ndarray | None:
-        """Where the base parameters are those of `given`, which may know more of the effects than `base` did."""
+        """A start at the base parameters of `given`, which may account for more effects than `base` does."""
         vector = self.coordinates.read(self.given)
         if not np.all(np.isfinite(vector)) or np.allclose(vector, self.centre, rtol=1e-6):
             return None
@@ -147,7 +147,7 @@ class Problem:
         )
 
     def share_of(self, step: np.ndarray) -> float:
-        """How much of a step may be made at once: statistics are straight lines of the parameters only nearby."""
+        """The share of a step that may be taken at once: statistics are linear in the parameters only nearby."""
         n = len(self.centre)
         base, own = np.abs(self.whiten @ step[:n]) / self.sizes, np.abs(step[n:])
         longest = max(base.max() / LONGEST_OF_BASE, own.max(initial=0.0) / LONGEST_STEP)

@@ -1,8 +1,8 @@
-"""Fitting effects that only say how they are drawn, by simulated statistics, together with the base parameters.
+"""Fitting effects that can be drawn but have no likelihood, by simulated statistics, with the base parameters.
 
 The statistics are those of the capture's structure, and the score (gradient of the exact base likelihood at the base
-fit), which carries all that the likelihood knows of the base parameters. Their expectation and covariance are
-simulated with common random numbers, and the parameters sought at which the expectation meets the measurement
+fit), which carries all the likelihood's information on the base parameters. Their expectation and covariance are
+simulated with common random numbers, and the fit seeks the parameters at which the expectation matches the measurement
 (efficient method of moments: Gallant and Tauchen, "Which moments to match?", Econometric Theory 12, 1996).
 """
 
@@ -28,14 +28,14 @@ from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
 MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 8, 2, 32
-SCATTER_DRAWS, SCATTER_FROM = 32, 1000  # draws for the weights; their numbers are none of those of the means
+SCATTER_DRAWS, SCATTER_FROM = 32, 1000  # draws for the weights; numbered apart from those for the means
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
-SLOPE_NOISE = 8.0  # a slope of less than the root of it, in its standard errors, counts as zero
-SLACK, MUCH_LESS = 0.02, 0.5  # of the cost: rare counts make it rough; a step that shows good derivatives
-LEAST_DAMPING = 0.1  # of the information, once a step failed
-SHORT_STEP, LONG_STEP = 0.2, 1.0  # standard errors: where the search ends, and where it has failed
-SURE_STEP = 2.0  # derivatives taken after a shorter step are near enough
-STEP_SIGMA, STEP_LOG = 2.0, 0.2  # for derivatives: standard errors, and for effects at most this in the logarithm
+SLOPE_NOISE = 8.0  # a slope of fewer standard errors than the root of this counts as zero
+SLACK, MUCH_LESS = 0.02, 0.5  # of the cost: tolerated rise (rare counts make it rough), fall if derivatives are good
+LEAST_DAMPING = 0.1  # of the information, after a failed step
+SHORT_STEP, LONG_STEP = 0.2, 1.0  # last step in standard errors: below, the search ends; above, it has failed
+SURE_STEP = 2.0  # after a shorter step the derivatives are still accurate enough
+STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of derivatives: in standard errors; for effects at most this in the logarithm
 
 
 def fit_synthetic(
@@ -48,8 +48,8 @@ def fit_synthetic(
 ) -> FitResult:
     """`base` with the effects of `model` that it lacks, and base parameters corrected for them.
 
-    base: fit of the same capture without those effects. model: its values are where the search for the effects starts.
-    Raises RuntimeError where the model's draws have no statistics.
+    base: fit of the same capture without those effects. model: its values start the search for the effects.
+    Raises RuntimeError if the statistics of the model's draws are not finite.
     """
     extra = tuple(name for name in model.names if name not in base.params)
     whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
@@ -60,7 +60,7 @@ def fit_synthetic(
 
 @dataclass(frozen=True)
 class _Point:
-    """Draws at y, and how far the measured statistics are off their mean [statistic], in deviations."""
+    """A point y, and how far the measured statistics are from the mean of draws there [statistic], in deviations."""
 
     y: np.ndarray
     off: np.ndarray
@@ -74,9 +74,9 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Yardstick:
-    """What statistics are measured by: their deviation [statistic], and in it draws [draw, statistic] and weights.
+    """The scale of the statistics: their deviation [statistic], and in its units draws [draw, statistic] and weights.
 
-    equal: weights [statistic, statistic] where none is far off, from all draws; halves: from either half of them.
+    equal: weights [statistic, statistic] if none is far off, from all draws; halves: from each half of the draws.
     """
 
     problem: Problem
@@ -117,7 +117,7 @@ class _Yardstick:
 
 
 def _weighted(equal: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Weights [statistic, statistic], those of statistics that are far off made smaller by their `share`."""
+    """Weights [statistic, statistic], reduced by `share` for statistics that are far off."""
     return share[:, None] * equal * share
 
 
@@ -125,7 +125,7 @@ def _without_noise(slopes: np.ndarray) -> np.ndarray:
     """Mean of slopes [draw, number, statistic], shrunk toward zero where draws differ.
 
     Otherwise the noise of hundreds of zero slopes would pass for information: estimates would stay near the start, and
-    their errors would be too small. The variance of so few draws is pooled: a factor for each number, one for each
+    their errors would be too small. The variance of so few draws is pooled: one factor per number times one per
     statistic.
     """
     mean, variance = slopes.mean(0), slopes.var(0, ddof=1) / len(slopes)
@@ -135,10 +135,10 @@ def _without_noise(slopes: np.ndarray) -> np.ndarray:
 
 
 def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Where simulation meets measurement: y, its covariance, the last step in standard errors, iterations.
+    """Where simulation matches measurement: y, its covariance, the last step in standard errors, iterations.
 
-    Gauss-Newton, with Levenberg's damping where a step leads away and Broyden's updates of the derivatives. Statistics
-    that are far off count less (Huber), so that what the model still lacks does not bias the rest.
+    Gauss-Newton, with Levenberg's damping after a step that fits worse and Broyden's updates of the derivatives.
+    Statistics that are far off count less (Huber), so that what the model still lacks does not bias the rest.
     """
     yard = _Yardstick.of(problem, simulator, problem.start)
     here, damping, taken, wanted, fresh, iterations = _first(problem, yard), 0.0, 0, True, False, 0
@@ -166,13 +166,13 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
         there = yard.point(ahead)
         before, after = here.cost(weight, problem), there.cost(weight, problem)
         if after < (1 + SLACK) * before + 1:
-            if length >= SURE_STEP:  # what shorter ones do is mostly that rare counts change
+            if length >= SURE_STEP:  # after shorter ones mostly rare counts differ
                 slopes = _updated(slopes, here, there)
             wanted = length >= SURE_STEP and after > MUCH_LESS * before and taken < MOST_SLOPES
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    # The search knows means to a third of their scatter, and scatter from where it began.
+    # The search knows means only to a third of their scatter, and the scatter only where it began.
     last = simulator.reference(problem.at(here.y), LAST_DRAWS)
     here = yard.point(here.y, LAST_DRAWS)
     step = covariance @ here.uphill(gain, problem)
@@ -181,7 +181,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
 
 
 def _updated(slopes: np.ndarray, here: _Point, there: _Point) -> np.ndarray:
-    """Derivatives [statistic, number] that give what a step did to the statistics, changed as little as can be.
+    """Derivatives [statistic, number] that reproduce what a step did to the statistics, changed as little as possible.
 
     Reference: Broyden, "A class of methods for solving nonlinear simultaneous equations", Math. Comp. 19, 1965.
     """
@@ -232,7 +232,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
 
 
 def _in_order(problem: Problem, covariance: np.ndarray) -> np.ndarray:
-    """`covariance` of all numbers that moved in the order of the table; what the base fit measured keeps its own."""
+    """`covariance` of all varied numbers, in table order; what only the base fit measured keeps its own."""
     base, added = problem.base, problem.added.names
     moved, names = [*problem.coordinates.names, *added], [*base.names, *added]
     whole = np.zeros((len(names), len(names)))
@@ -245,7 +245,7 @@ def _in_order(problem: Problem, covariance: np.ndarray) -> np.ndarray:
 
 
 def _loose(problem: Problem, covariance: np.ndarray, result: FitResult) -> list[str]:
-    """Sentences on numbers of effects that hardly moved from where the search started; covariance: of y."""
+    """Sentences on numbers of effects that are hardly better known than at the start; covariance: of y."""
     deviation = np.sqrt(np.diagonal(covariance))[len(problem.centre) :]
     told = []
     for number, sigma in zip(problem.added.numbers, deviation, strict=True):

@@ -25,13 +25,13 @@ from hsnoise.model import NoiseModel
 # Added to the probability of each bin: bounds the influence of a pixel that the model excludes (a cosmic hit), and
 # the gradient far from the optimum. Changes a possible pixel's log-likelihood by less than 1e-6 relative.
 FLOOR = 1e-10
-LEAST_ROW_SIGMA = 1e-6  # rows without a gain of their own are integrated over this; a fit may end at exactly 0
+LEAST_ROW_SIGMA = 1e-6  # replaces a sigma of 0 in the integral over the row gain; a fit may end at exactly 0
 
 
 class Block(eqx.Module):
     """Groups of rows that share a number of nodes: counts [part, group, row, bin], beta in low..high [part, group].
 
-    open_below: whether the nodes of a group begin where the prior ends, or at zero, before its rows' curves vanish.
+    open_below: whether a group's nodes begin at the end of the prior or at zero, where its rows' curves do not vanish.
     """
 
     counts: np.ndarray
@@ -65,7 +65,7 @@ Rules = tuple[RowRule, ...]
 def likelihood_part(model: NoiseModel) -> NoiseModel:
     """The effects of a model that the likelihood knows, in float64 (enabled here).
 
-    Its own exposure is 0: those of the summary count, and captures of other exposures share programs.
+    Its own exposure is set to 0: those of the summary count, and captures of different exposures share programs.
     """
     with jax.enable_x64(True):
         known = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), [e for e in model if e.in_likelihood])
@@ -99,8 +99,8 @@ def black_level_at(model: NoiseModel, exposure_s):
 def evaluate(model: NoiseModel, summary: Summary, rules: Rules, outliers: jax.Array | None = None) -> jax.Array:
     """Log-likelihood in float64 (enabled by the caller) of a `likelihood_part`.
 
-    outliers [exposure]: fraction of pixels that follow no such model (hot pixels, cosmic hits) and may hold any count;
-    None for none. It keeps them from bending the estimates of all the others.
+    outliers [exposure]: fraction of pixels that do not follow the model (hot pixels, cosmic hits) and may hold any
+    count; None for none. It keeps them from biasing the parameters of all the others.
     """
     total = jnp.zeros((), jnp.float64)
     if summary.histograms:
@@ -119,10 +119,10 @@ def dark_laws(model: NoiseModel, exposure_s):
 
 
 class Tables(NamedTuple):
-    """What the likelihood knows of the rows of a part at some parameters.
+    """What the likelihood needs for the rows of a part at given parameters.
 
-    log_p: log P(bin | beta) [group, node, bin] of each block. prior: of the row gain: its variance where rows are
-    white, its spectrum [row] where they are coloured, None without row gain.
+    log_p: log P(bin | beta) [group, node, bin] of each block. prior: variance of the row gain if rows are white,
+    its spectrum [row] if they are coloured, None without row gain.
     """
 
     log_p: tuple[jax.Array, ...]
@@ -180,8 +180,8 @@ def evidence(tables: Tables, nodes: tuple[rows.Nodes, ...], counts, layout: rows
 def _curves(counts, table):
     """Log-likelihood of each row at the nodes of its group [group, row, node].
 
-    Group by group, so that the counts as floats stay in the cache: a quarter of the time of all at once. The way back
-    is in float32, which counts fit into: a sum of shares of pixels, of which the noise is far above its rounding.
+    Group by group, so that the counts as floats stay in the cache: a quarter of the time of all at once. The backward
+    pass is in float32, which holds counts exactly: it sums shares of pixels, whose noise is far above the rounding.
     """
     return jax.lax.map(lambda x: x[0].astype(x[1].dtype) @ x[1].T, (counts, table))
 
@@ -220,8 +220,8 @@ def binning(summary: Summary, laws, channel, exposure, edges_dn, outlier_law) ->
 def _sum_with_gradient(function, moved, inputs):
     """Sum of function(moved, inputs[i]) over the parts i, one at a time.
 
-    Its gradient is made together with its value, part by part, so that memory and compilation are those of one part.
-    The price: only first derivatives, in reverse mode (those of coloured rows would be wrong beyond).
+    The gradient is computed with the value, part by part, so that memory and compilation are those of one part.
+    The price: only first derivatives in reverse mode (higher ones of coloured rows would be wrong).
     """
 
     @jax.custom_vjp
@@ -265,7 +265,7 @@ def flat_law(model: NoiseModel, flats: FlatMoments) -> FlatLaw:
 
 
 def flat_gain_of(model: NoiseModel, flats: FlatMoments) -> FlatGain:
-    """Gain of the flats alone, above black and noise of the darks where they were measured, else of `model`."""
+    """Gain from the flats alone, relative to black and noise of the darks if measured, else of `model`."""
     with jax.enable_x64(True):
         black_dn, variance_dn2 = (np.asarray(x) for x in without_light(flat_law(likelihood_part(model), flats), flats))
     return flat_gain(flats, black_dn, variance_dn2, np.nan_to_num(flats.dark_error_dn2))

@@ -9,9 +9,9 @@ falls 2 % short at full scale takes 6 % off V / S there. `local_gain` turns the 
 differential gain: K^2 e = r S with r = V / S is a differential equation for e(S), solved by a quadrature,
 sqrt(e) = 1/2 integral of dS / sqrt(r S).
 
-Real sensors often leave any smooth curve by more than chance (steps between gain stages, processing in the camera). A
-curve that does not describe the levels is no reason to extrapolate: the gain is then that of EMVA 1288's line, all
-levels up to 70 % of saturation weighted by their signal, and its error is what the levels disagree by.
+Real sensors often deviate from any smooth curve by more than chance (steps between gain stages, processing in the
+camera). If no curve describes the levels, none is extrapolated: the gain is then that of EMVA 1288's line through all
+levels up to 70 % of saturation, weighted by signal, and its error is the disagreement of the levels.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from hsnoise.likelihood.flats import FlatMoments
 MOST_DEGREES = 2  # of the curve
 SIGNIFICANT = 0.002  # p-value below which the curve has one more degree
 ADEQUATE = 3.0  # chi2 per degree of freedom up to which a curve describes the levels
-LEAST_RANGE = 0.5  # of the range of signals that levels must span after the highest are left out
+LEAST_RANGE = 0.5  # share of the signal range that levels must span after the highest are left out
 FEWEST_LEVELS = 4  # likewise
 LINE_RANGE = 0.7  # of saturation: EMVA 1288, release 4, section 6.6
-NARROW_DN2 = 0.25  # of variance, rounding included: below, rounding depends on where the mean lies between counts
-LOW = 0.25  # of the highest signal: a level below shows where the curve begins
-PAST_PEAK, STEEP = 0.05, 0.1  # the variance falls by more than this: from its highest value, anywhere: saturation
+NARROW_DN2 = 0.25  # variance, rounding included, below which rounding depends on where the mean lies between counts
+LOW = 0.25  # of the highest signal: a level below it shows where the curve begins
+PAST_PEAK, STEEP = 0.05, 0.1  # saturation: the variance falls by more than this, from its peak or anywhere
 LEAST_SIGMAS = 3.0  # by which a level's variance must exceed that of the darks
 
 
 class FlatGain(NamedTuple):
-    """Gain of flats, DN/e-, and the curve of their variance. Arrays [channel], or as said.
+    """Gain of flats, DN/e-, and the curve of their variance. Arrays are [channel] unless stated.
 
     gain: at low signal if `described`, that is if a straight line or a curve describes the levels, else that of EMVA
     1288's line. standard_error includes the scatter of levels beyond chance. bend, bend_error [channel, 2]: a1 and a2,
-    0 if not significant; full_scale_dn: the signal where x is 1. chi2, dof: of the curve, by chance errors.
-    used [level, channel]: the levels that gave the gain. level_gain, level_error [level, channel]: variance over
+    0 if not significant; full_scale_dn: the signal where x is 1. chi2, dof: of the curve, with chance errors.
+    used [level, channel]: the levels that determine the gain. level_gain, level_error [level, channel]: variance over
     signal and its chance error, NaN without signal. signal_dn [level, channel].
     weight [level, channel]: degrees of freedom with which the levels' variances give this gain with this error.
     """
@@ -83,7 +83,7 @@ class _Curve(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Of errors: the scatter beyond chance, never below 1."""
+        """Factor on errors: the scatter beyond chance, never below 1."""
         return float(np.sqrt(max(self.chi2 / max(self.dof, 1), 1.0)))
 
     @property
@@ -101,7 +101,7 @@ def flat_gain(flats, black_dn=None, read_variance_dn2=None, read_variance_error_
         read_variance_dn2: temporal variance of those darks as measured, rounding included; same shapes; None likewise.
         read_variance_error_dn2: its standard error, where it is given.
 
-    Gain NaN and error infinite where no level has a variance above that of the darks, or nothing is known of darks.
+    The gain is NaN and its error infinite if no level has more variance than the darks, or the darks are unknown.
     """
     flats = flats if isinstance(flats, FlatMoments) else flats.flats
     shape = flats.mean_dn.shape
@@ -158,7 +158,7 @@ def _excess(flats: FlatMoments, c: int, signal, read, read_error) -> tuple[np.nd
 
 
 def _usable(signal, excess, error, variance) -> tuple[np.ndarray, _Levels]:
-    """Places of the levels below saturation whose variance says something, by rising signal, and what it is."""
+    """Indices of the levels below saturation with a significant variance, by rising signal, and these levels."""
     lit = (signal > 0) & (excess > LEAST_SIGMAS * error) & (variance > NARROW_DN2)
     order = np.flatnonzero(lit)[np.argsort(signal[lit], kind="stable")]
     order = order[: _saturation(excess[order]) + 1] if len(order) else order
@@ -166,13 +166,13 @@ def _usable(signal, excess, error, variance) -> tuple[np.ndarray, _Levels]:
 
 
 def row_gain_variance(flats: FlatMoments, signal, c: int) -> float:
-    """Variance of the gain of rows, which scales the variance within them; 0 if chance."""
+    """Variance of the row gain, which scales the variance within rows; 0 if within chance."""
     mean, error = row_gain_of(flats, signal, c)
     return mean if mean > 5 * error else 0.0
 
 
 def row_gain_of(flats: FlatMoments, signal, c: int) -> tuple[float, float]:
-    """Variance of the gain of rows from what the means of rows have in common, and its standard error."""
+    """Variance of the row gain, from the scatter of row means beyond pixel noise, and its standard error."""
     lit = signal > 0
     if not lit.any():
         return 0.0, np.inf
@@ -192,7 +192,7 @@ def _saturation(excess: np.ndarray) -> int:
 
 
 def _longest(levels: _Levels, full_scale: float) -> tuple[int, _Curve]:
-    """The most levels, from the lowest, that a curve describes, and that curve; else that of all."""
+    """The largest number of levels, from the lowest up, that a curve describes, and that curve; else that of all."""
     whole = _curve(levels, full_scale)
     for n in range(len(levels.signal), 0, -1):
         if n < len(levels.signal) and (n < FEWEST_LEVELS or levels.signal[n - 1] < LEAST_RANGE * full_scale):
@@ -204,7 +204,7 @@ def _longest(levels: _Levels, full_scale: float) -> tuple[int, _Curve]:
 
 
 def _curve(levels: _Levels, full_scale: float) -> _Curve:
-    """The curve of the lowest degree that a higher one does not improve on, given the scatter that there is."""
+    """The curve of the lowest degree on which no higher one improves significantly, given the scatter."""
     curves = [
         _least_squares(levels, full_scale, d) for d in range(min(MOST_DEGREES, (len(levels.signal) - 1) // 2) + 1)
     ]
@@ -229,8 +229,8 @@ def _least_squares(levels: _Levels, full_scale: float, degree: int) -> _Curve:
 def _line(levels: _Levels, n: int) -> tuple[float, float]:
     """EMVA 1288's gain of the n lowest levels and its standard error.
 
-    The error: scatter of the levels about the line, and half of what the lower and the upper levels differ by, because
-    a deviation that is smooth in the signal is no chance.
+    Its parts are the scatter of the levels about the line, and half the difference between lower and upper levels,
+    because a deviation that is smooth in the signal is not chance.
     """
 
     def slope(signal, excess):
@@ -260,7 +260,7 @@ def variance_curve(found: FlatGain, c: int, signal_dn) -> np.ndarray:
 
 
 def local_gain(found: FlatGain, c: int, signal_dn) -> np.ndarray:
-    """Differential gain of channel c at these signals, DN/e- [signal], if its response bends the variance."""
+    """Differential gain of channel c at these signals, DN/e- [signal], if its response bends the variance curve."""
     # With S = u^2 the integral of dS / sqrt(r S) is that of 2 du / sqrt(r), which has no pole.
     nodes, weights = np.polynomial.legendre.leggauss(12)
     signal = np.asarray(signal_dn, np.float64)

@@ -1,10 +1,10 @@
 """Photon transfer of flats: mean, temporal variance and the common part of rows of each level.
 
-Flats have a fixed pattern of light and of response: only what changes between frames of one light is noise (Janesick,
-*Photon Transfer*, 2007; EMVA 1288). Frames are divided by their own mean above black, because a lamp flickers and a sky
-darkens, and what is left of rows and columns is taken off, because its gradient turns. In frames of different light
-S_f the variance over time then is K S + V_read, to first order whatever their ratios, where S is their harmonic mean:
-thus two single flats of a series at twilight make a level.
+Flats have a fixed pattern of light and of response: only changes between frames of the same light are noise
+(Janesick, *Photon Transfer*, 2007; EMVA 1288). Frames are divided by their own mean above black, because lamps flicker
+and skies darken, and what remains in rows and columns is subtracted, because sky gradients turn. The temporal variance
+of frames of different light S_f is then K S + V_read, to first order for any ratio, where S is their harmonic mean: two
+single flats of a twilight series therefore make a level.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.flat_pairs import Shot, pairs_of_singles
 from hsnoise.statistics.pixels.clipping import unclipped
 
-FLICKER = 0.5  # of the mean: more is another light
-OUTLIERS = 1e-7  # chance that a pixel is taken for one hit by a cosmic ray
-CLEAR_SIGMAS = 5.0  # of a pixel's mean from where it is clipped
+FLICKER = 0.5  # of the mean: more is a change of light
+OUTLIERS = 1e-7  # chance that an ordinary pixel is taken for a cosmic ray
+CLEAR_SIGMAS = 5.0  # between a pixel's mean and the clipping level
 DARK_CLEAR_SIGMAS = 3.0  # likewise, of darks: a thousandth of them clipped changes their variance by 1 %
-PILED_UP = 1e-3  # of the pixels on the highest count: it is where they saturate
-FEWEST_PILED = 10  # likewise
-FEWEST_PIXELS = 0.5  # of a level, after those that saturate
-CLEAR_DARKS = 0.98  # of darks, else they clip
-FEW_CLIPPED = 0.02  # of the counts of darks: as if their noise were normal
+PILED_UP = 1e-3  # share of the pixels at the highest count that makes it the saturation level
+FEWEST_PILED = 10  # likewise, in pixels
+FEWEST_PIXELS = 0.5  # share of a level's pixels that must not saturate
+CLEAR_DARKS = 0.98  # share of the pixels of darks that must not clip
+FEW_CLIPPED = 0.02  # of the counts of darks: corrected as for normal noise
 SAME_EXPOSURE = 0.01
-SAMPLE_PIXELS = 100_000  # for what is typical
+SAMPLE_PIXELS = 100_000  # for typical values
 OUTER = 1e-3  # of the pixels on each side
-NARROW_DN2 = 0.25  # of variance: below, many pixels hold the highest count
-MOST_DARKS = 16  # frames that a level of darks is measured on
+NARROW_DN2 = 0.25  # variance below which many pixels hold the highest count
+MOST_DARKS = 16  # frames from which a level of darks is measured
 
 
 class FlatMoments(eqx.Module):
     """Photon transfer of the flats: [level, channel] mean, temporal variance within rows, degrees of freedom.
 
     `row_power` is the mean square of row means of frame differences over 2, `row_dof` its degrees of freedom.
-    dark_dn, dark_variance_dn2, dark_error_dn2 [level, channel]: mean and variance, measured likewise, of darks of the
-    level's own exposure or else the shortest, and the variance's standard error; NaN without darks, or if they clip.
+    dark_dn, dark_variance_dn2, dark_error_dn2 [level, channel]: mean and variance, measured in the same way, of darks
+    of the level's own exposure or else the shortest, and the variance's error; NaN without darks or if they clip.
     overscan_dn, photons_e [level] NaN if unknown. curve [level, channel]: variance over signal relative to low signal;
-    weight [level, channel]: degrees of freedom that the likelihood gives a level, 0 for none; until `flat_gain` has
-    judged the levels, 1 and `dof`. set_aside: sentences about levels that could not be used.
+    weight [level, channel]: degrees of freedom that the likelihood gives a level, 0 for none. Before `flat_gain`
+    judges the levels, curve is 1 and weight is `dof`. set_aside: sentences about levels that could not be used.
     """
 
     exposure_s: np.ndarray
@@ -66,7 +66,7 @@ class FlatMoments(eqx.Module):
     set_aside: tuple[str, ...] = eqx.field(static=True, default=())
 
     def straightened(self) -> FlatMoments:
-        """The levels that count, their variance as if the response were straight, `weight` for `dof`."""
+        """The levels in use, with the variance of a linear response, and with `weight` as `dof`."""
         used = (self.weight > 0).any(1)
         dark = np.nan_to_num(self.dark_variance_dn2)
         variance = dark + (self.variance_dn2 - dark) / self.curve
@@ -75,7 +75,7 @@ class FlatMoments(eqx.Module):
 
 
 class Measured(NamedTuple):
-    """One level, or darks: mean and variance over time [channel], and what FlatMoments has of them."""
+    """One level, or darks: mean and temporal variance [channel], as in FlatMoments, and the share of pixels kept."""
 
     mean_dn: np.ndarray
     variance_dn2: np.ndarray
@@ -91,7 +91,7 @@ def flat_moments(stack: FrameStack, tick) -> FlatMoments | None:
 
     `tick` is called after each frame of the stack.
 
-    Raises ValueError for a group of frames in different light, and where no level is left and there are no darks.
+    Raises ValueError if frames of a group differ in light, or if no level is left and there are no darks.
     """
     darks = _dark_levels(stack)
     parts, aside = [], []
@@ -143,7 +143,7 @@ def _named(stack: FrameStack, group: int) -> str:
 
 
 def _fields(stack: FrameStack, shots: list[Shot], level: Measured, dark: Measured) -> dict:
-    """A level as FlatMoments has it."""
+    """The fields of FlatMoments for one level."""
     groups = sorted({shot.group for shot in shots})
 
     def known(values):
@@ -162,7 +162,7 @@ def _fields(stack: FrameStack, shots: list[Shot], level: Measured, dark: Measure
 
 
 def _black(stack: FrameStack, dark: Measured) -> np.ndarray:
-    """Count without light [channel] that frames are scaled from: of darks, or as given, or 0."""
+    """Count without light [channel], above which frames are scaled: from darks, as given, or 0."""
     given = 0.0 if stack.black_level is None else stack.black_level
     return np.where(np.isfinite(dark.mean_dn), dark.mean_dn, np.broadcast_to(given, len(stack.channels)))
 
@@ -197,9 +197,9 @@ def _dark_of(exposure_s: float, darks: list[tuple[float, Measured]], channels: i
 class _Sums(NamedTuple):
     """Sums over frames of one channel of counts relative to the frame's light.
 
-    relative, squares [row, pixel]: counts, and squares of what rows and columns leave of them; rows [row], columns
-    [pixel]: of their means; row_means [frame, row] DN; light [frame]: mean above black, DN (1 for darks);
-    lowest, highest: count of all; at_highest: how many pixels hold it.
+    relative, squares [row, pixel]: counts, and squares of their residuals from rows and columns; rows [row], columns
+    [pixel]: row and column means; row_means [frame, row] DN; light [frame]: mean above black, DN (1 for darks);
+    lowest, highest: extreme counts; at_highest: how many pixels hold the highest.
     """
 
     relative: np.ndarray
@@ -237,14 +237,14 @@ def _sums(frame: np.ndarray, cfa: str, channels: tuple[str, ...], black: np.ndar
 
 
 def _within_reach(y: np.ndarray) -> np.ndarray:
-    """Counts, those far outside all others moved to where the others end: one cosmic ray moves the mean of its row."""
+    """Counts, with outliers clipped to near the range of the others: one cosmic ray would shift its row's mean."""
     low, high = np.quantile(y.ravel()[:: max(y.size // SAMPLE_PIXELS, 1)], (OUTER, 1 - OUTER))
     margin = max((high - low) / 2, 1.0)
     return np.clip(y, np.float32(low - margin), np.float32(high + margin))
 
 
 def _added(a: dict[str, _Sums], b: dict[str, _Sums]) -> dict[str, _Sums]:
-    """Of all frames of both."""
+    """The sums over the frames of both."""
     return {c: _added_channel(a[c], b[c]) for c in a}
 
 
@@ -279,7 +279,7 @@ def _measure(
 
 
 def _read(stack: FrameStack, shots: list[Shot], black: dict[int, np.ndarray], lit: bool, tick):
-    """The sums of the frames, some as one."""
+    """The sums of the frames, some of them already added up."""
     for group in dict.fromkeys(shot.group for shot in shots):
         numbers = [shot.number for shot in shots if shot.group == group]
         reduced = partial(_sums, cfa=stack.cfa, channels=stack.channels, black=black[group] if lit else None)
@@ -289,7 +289,7 @@ def _read(stack: FrameStack, shots: list[Shot], black: dict[int, np.ndarray], li
 
 
 def _check_same_light(levels: list[float], stack: FrameStack, shots: list[Shot]) -> None:
-    """Frames of a flat group must be of one light: a lamp may flicker, not change."""
+    """Frames of a flat group must be of the same light: a lamp may flicker, not change."""
     group = shots[0].group
     if all(shot.group == group for shot in shots) and max(levels) - min(levels) > FLICKER * np.mean(levels):
         raise ValueError(
@@ -315,7 +315,7 @@ def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | 
         level, corrected, growth = whole
         return level, corrected, kept.sum() * centred * (n - 1) / growth**2, *_of_rows(sums, zero_dn, light), 1.0
     clear = kept & _unclipped(sums, zero_dn + light * relative, typical, white_level, is_dark)
-    # Frames of unequal light weigh the read noise by more than one.
+    # With frames of unequal light the read noise has a weight above 1.
     more = n * (1 / sums.light**2).sum() / (1 / sums.light).sum() ** 2 - 1
     if not clear.any():
         return zero_dn, *np.full(5, np.nan), 1e-9
@@ -329,7 +329,7 @@ def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | 
 
 
 def _of_rows(sums: _Sums, zero_dn: float, light: float) -> tuple[float, float, float]:
-    """Mean square of what changes in the means of rows, DN^2, its degrees of freedom, and pixels in a row."""
+    """Mean square of the changes of row means, DN^2, its degrees of freedom, and pixels in a row."""
     series = (sums.row_means - zero_dn) * (light / sums.light[:, None])
     moving = series - series.mean(1, keepdims=True)  # the lamp may flicker from frame to frame
     moving -= moving.mean(0, keepdims=True)
@@ -339,7 +339,7 @@ def _of_rows(sums: _Sums, zero_dn: float, light: float) -> tuple[float, float, f
 
 
 def _without_clipping(level: np.ndarray, variance: float, frames: int) -> tuple[float, float, float] | None:
-    """Mean and variance over time, DN, DN^2, that darks have without their few counts at 0, and the growth of an error.
+    """Mean (DN) and temporal variance (DN^2) of darks, corrected for few counts at 0, and the growth of an error.
 
     level: mean of each pixel over the frames. None where more than a few counts clip: their noise need not be normal.
     """
@@ -352,7 +352,7 @@ def _without_clipping(level: np.ndarray, variance: float, frames: int) -> tuple[
 
 
 def _ordinary(variance: np.ndarray, relative: np.ndarray, frames: int) -> np.ndarray:
-    """Pixels whose variance over time is chance [row, pixel]: no cosmic ray, no jump between levels."""
+    """Pixels whose temporal variance is within chance [row, pixel]: no cosmic ray, no jump between levels."""
     some = variance.ravel()[:: max(variance.size // SAMPLE_PIXELS, 1)]
     typical = some[some <= np.quantile(some, 0.99)].mean(dtype=np.float64)
     limit = scipy.stats.chi2.isf(OUTLIERS, frames - 1) / (frames - 1)
@@ -360,8 +360,8 @@ def _ordinary(variance: np.ndarray, relative: np.ndarray, frames: int) -> np.nda
 
 
 def _unclipped(sums: _Sums, level: np.ndarray, variance: float, white_level: float | None, is_dark: bool) -> np.ndarray:
-    """Pixels whose counts stay clear of 0 and white [row, pixel]; chosen by their mean, of which the variance of normal
-    noise is independent."""
+    """Pixels whose counts stay clear of 0 and white [row, pixel]; chosen by their mean, which is independent of the
+    variance of normal noise."""
     white = np.inf if white_level is None else white_level
     many = max(PILED_UP * level.size * len(sums.light), FEWEST_PILED)
     if not is_dark and variance > NARROW_DN2 and sums.at_highest > many:

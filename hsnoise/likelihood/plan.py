@@ -29,16 +29,16 @@ from hsnoise.model import NoiseModel
 
 SCAN_NODES = 256
 KEEP_NATS = 25.0  # a node where every row of a group is this far below its best is left out
-# In beta on either side: so that the parameters may move during a fit, and where they are almost known.
+# Factors in beta on either side: so that parameters can move during a fit, and where they are almost known.
 MARGIN, CLOSE_MARGIN = 1.35, 1.05
 EXTREME_ROWS = 6
 NODES_PER_SIGMA = 0.75  # of the sharpest row; the trapezoid's error is exp(-2 (0.75 pi)^2) (Poisson summation)
 MOST_NODES = 1024
-# Further nodes: where the integrand ends at a gain of zero, or each of few rows counts; and where errors average out.
+# Extra nodes: if the integrand ends at a gain of zero, or rows are few; and if there are enough to average out errors.
 SPARE, SPARE_OF_MANY = 16, 4
 GROUP_ROWS, MOST_GROUPS, SPLIT_FROM = 192, 24, 8
 
-_At = tuple[NoiseModel, jax.Array | None]  # a model and the shares of outliers beside it
+_At = tuple[NoiseModel, jax.Array | None]  # a model and its shares of outliers
 
 
 def plan_rules(
@@ -46,8 +46,8 @@ def plan_rules(
 ) -> Rules:
     """Quadrature rules for the rows at `model` (at the moment estimates while `model` is traced).
 
-    margin: in beta, on either side of where the rows are now (at least MARGIN while it is traced). channel: of that
-        channel only. outliers: as in `evaluate`.
+    margin: in beta, on either side of where the rows are now (at least MARGIN while `model` is traced). channel: plan
+        this channel only. outliers: as in `evaluate`.
     """
     if not summary.histograms:
         return ()
@@ -83,13 +83,13 @@ def _rule(at: _At, chosen: list[int], summary: Summary, margin: float) -> RowRul
 
 
 def like(block: Block, others: Sequence[Block]) -> Block:
-    """A block with as many nodes as the `others` have, so that they share a program."""
+    """A block with at least as many nodes as the `others`, so that they share a program."""
     blocks = block, *others
     return replace(block, nodes=max(b.nodes for b in blocks), open_below=any(b.open_below for b in blocks))
 
 
 def replan(old: Rules, new: Rules) -> Rules:
-    """New rules with the old numbers of nodes and bins where they are enough, which spares a compilation."""
+    """New rules with the old numbers of nodes and bins if these suffice, which saves a compilation."""
 
     def enough(old, new):
         new = _with_bins(new, old.outlier_law.shape[-1])
@@ -109,13 +109,13 @@ def with_rows_of(rule: RowRule, summary: Summary) -> RowRule:
         return replace(rule, blocks=(replace(rule.blocks[0], counts=pooled[:, None, None, :]),))
     layouts, counts = zip(*map(_sort_rows, histograms), strict=True)
     ends = np.cumsum([block.low.shape[1] for block in rule.blocks])
-    parts = np.split(np.concatenate(counts), ends[:-1], axis=1)  # a block's groups follow those of the one before
+    parts = np.split(np.concatenate(counts), ends[:-1], axis=1)  # a block's groups follow those of the previous one
     blocks = tuple(replace(block, counts=of_block) for block, of_block in zip(rule.blocks, parts, strict=True))
     return replace(rule, blocks=blocks, layout=jax.tree.map(lambda *x: np.concatenate(x), *layouts))
 
 
 def _in_bins(h: RowHistograms, edges: np.ndarray) -> RowHistograms:
-    """Histograms with the edges [exposure, bin - 1], some of their own; those that repeat leave bins empty."""
+    """Histograms with these edges [exposure, bin - 1], a subset of their own; repeated edges leave bins empty."""
     counts = np.zeros((*h.counts.shape[:-1], edges.shape[-1] + 1), h.counts.dtype)
     for e, (own, wanted) in enumerate(zip(h.edges_dn, edges, strict=True)):
         starts = np.r_[0, np.searchsorted(own, np.unique(wanted)) + 1]
@@ -125,7 +125,7 @@ def _in_bins(h: RowHistograms, edges: np.ndarray) -> RowHistograms:
 
 
 def _with_bins(rule: RowRule, bins: int) -> RowRule:
-    """The rule with at least as many bins: further ones, empty and of no width, before the last."""
+    """The rule with at least this many bins: new ones are empty, have no width, and come before the last."""
     further = bins - rule.outlier_law.shape[-1]
     if further <= 0:
         return rule
@@ -139,7 +139,7 @@ def _with_bins(rule: RowRule, bins: int) -> RowRule:
 
 
 def _used_bins(histograms: list[RowHistograms]) -> list[RowHistograms]:
-    """The same without the bins that no row uses, about half of them: each run of such bins is one."""
+    """The same without bins that no row uses, about half of them: each run of unused bins becomes one."""
     used = [h.counts.any((1, 2)) for h in histograms]
     kept = [u[:, :-1] | u[:, 1:] for u in used]  # edges beside a bin that is used
     for k in kept:
@@ -156,7 +156,7 @@ def _has_many_rows(h: RowHistograms) -> bool:
 
 
 def _merged(h: RowHistograms, used: np.ndarray, kept: np.ndarray, size: int) -> RowHistograms:
-    """Histograms with the edges `kept` [exposure, bin - 1] alone, and empty bins of no width before the last."""
+    """Histograms with only the edges `kept` [exposure, bin - 1], and empty bins of no width before the last."""
     counts = np.zeros((*h.counts.shape[:-1], size), h.counts.dtype)
     edges, outliers = np.empty((len(used), size - 1)), np.zeros((len(used), size))
     for e, keep in enumerate(kept):
@@ -179,15 +179,15 @@ def _channel_blocks(at: _At, c: int, histograms: RowHistograms, summary: Summary
     beta, table, information = (np.asarray(x) for x in _scan(at, c, without_counts(summary), *bins, scale))
     layout, counts = _sort_rows(histograms)
     low, high, peak = _reach(table, beta, counts)
-    # Rows of almost only one count are skewed, not narrow: they do not set the resolution.
+    # Rows that hold almost a single count are skewed, not narrow: they do not set the resolution.
     seen = (beta[:, 1:] >= np.maximum(low[:, :1], 3 * scale[:, None])) & (beta[:, 1:] <= high[:, -1:])
     best = np.where(seen, information, 0).max(1) * histograms.row_pixels.max((1, 2))
-    # The prior is part of what the nodes must resolve: its width in u where the rows are densest.
+    # The nodes must resolve the prior as well: its width in u where the rows are densest.
     width = np.minimum(1 / np.sqrt(best + 1e-12), sigma / np.sqrt(scale**2 + 1))[:, None]
     top, bottom = 1 + rows.PRIOR_REACH * sigma, max(1 - rows.PRIOR_REACH * sigma, 0.0)
     low, high = low / margin, high * margin
     if summary.shutter == "rolling":
-        # The gains of coloured rows have a mean of 1: where that of the rows' best is another, all are pulled there.
+        # The gains of coloured rows have a mean of 1: if that of the rows' best gains is not 1, all are shifted.
         pull = 1 - peak.mean(1, keepdims=True)
         low, high = low + np.minimum(pull, 0), high + np.maximum(pull, 0)
     low, high = np.clip(low, bottom, top), np.clip(high, bottom, top)
@@ -209,10 +209,10 @@ def _sort_rows(histograms: RowHistograms) -> tuple[rows.Layout, np.ndarray]:
     groups = int(np.clip(total // GROUP_ROWS, 1, MOST_GROUPS))
     places = -(-total // groups)
     pixels, mean, _ = binned_moments(histograms)
-    rank = np.where(pixels > 0, mean, np.inf).reshape(exposures, total)  # rows that are not there come last
+    rank = np.where(pixels > 0, mean, np.inf).reshape(exposures, total)  # missing rows come last
     order = np.full((exposures, groups * places), total)
     order[:, :total] = np.argsort(rank, axis=1, kind="stable")
-    # The darkest, the brightest, then all between: those at the ends need rules of their own.
+    # The darkest, the brightest, then all between: those at the ends need their own rules.
     ends_first = np.r_[0, groups - 1, 1 : groups - 1][:groups]
     order = order.reshape(exposures, groups, places)[:, ends_first].reshape(exposures, -1)
     place = np.argsort(order, axis=1, kind="stable")[:, :total].reshape(exposures, frames, n)
@@ -245,12 +245,12 @@ def _scan(sensor: _At, c: int, summary: Summary, edges_dn, outlier_law, scale):
 
 
 def _reach(table: np.ndarray, beta: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Range of beta where the most extreme rows of a group keep any likelihood, and its best: [exposure, group]."""
+    """Range of beta where the most extreme rows of a group have any likelihood, and its best beta [exposure, group]."""
     ends = np.zeros((*counts.shape[:2], 4 * EXTREME_ROWS, counts.shape[-1]), counts.dtype)
     for at in np.ndindex(counts.shape[:2]):
         extreme = _extreme_rows(counts[at])
         ends[at][: len(extreme)] = extreme
-    # In JAX: NumPy's threads get into each other's way where captures are planned side by side.
+    # In JAX, because NumPy's threads compete if captures are planned in parallel.
     curves = np.asarray(jnp.einsum("egrb,enb->egrn", ends.astype(np.float64), table))
     whole = np.asarray(jnp.einsum("egb,enb->egn", counts.sum(2, dtype=np.float64), table))
     alive = (curves >= curves.max(-1, keepdims=True) - KEEP_NATS) & ends.any(-1)[..., None]

@@ -1,7 +1,7 @@
 """Integrating the row gain out: white rows by quadrature, coloured rows by expectation consistency.
 
 A row's pixels depend on its gain beta only through the curve log L(beta), given on the nodes of a `Nodes` rule.
-White rows are independent: one integral each. Coloured rows share a circulant Gaussian prior: the expectation
+White rows are independent: one integral each. Coloured rows share a circulant Gaussian prior: they use the expectation
 consistent approximation (Opper and Winther, "Expectation consistent approximate inference", JMLR 2005) with one
 precision for all rows of a frame. It is exact for white rows, exact in the mean for Gaussian curves, costs one FFT a
 step, and is stationary at its fixed point, so that its gradient needs no derivative of the iteration.
@@ -17,14 +17,14 @@ from jax.scipy.special import log_ndtr, logsumexp
 from hsnoise._core.coloured import row_gain_power
 
 ITERATIONS = 80
-WHOLE_STEPS = 20  # later ones are shortened, against going round in circles
-# Steps converge quadratically: after one as long as this, in deviations of a row, a hundredth of it is left. The
-# evidence is stationary at the fixed point: its error is the square of that, a row.
+WHOLE_STEPS = 20  # later ones are shortened, to prevent cycles
+# Steps converge quadratically: after one of this length, in deviations of a row, a hundredth of it remains. The
+# evidence is stationary at the fixed point, so its error per row is the square of the remainder.
 TOLERANCE = 2e-3
-GAUSSIAN_STEPS, GAUSSIAN_TOLERANCE = 12, 2e-4  # with the rows' curves as Gaussians, between two looks at them
+GAUSSIAN_STEPS, GAUSSIAN_TOLERANCE = 12, 2e-4  # with Gaussians for the rows' curves, between two evaluations
 FAILED = 0.5  # a frame that still changes by more, in deviations of a row, has no evidence: NaN
 LEAST_SHARE, LEAST_PRECISION = 1e-9, 0.2  # of a cavity's variance, and of a row's precision, in steps of Gaussians
-FARTHEST, FARTHEST_SIGMA = 0.1, 2.0  # that a row's gain moves in one step: so far and so many of its own deviations
+FARTHEST, FARTHEST_SIGMA = 0.1, 2.0  # limits of a row's move in one step: in gain, and in its own deviations
 PRIOR_REACH = 7.5  # standard deviations of the row gain that the nodes cover
 
 
@@ -32,8 +32,8 @@ class Nodes(eqx.Module):
     """Quadrature rules in beta = scale * sinh(u), u uniform: as fine as a row can resolve, at every gain.
 
     Rows are sorted into groups of similar gain, and each group has its own rule: `beta` and `log_weight` have shape
-    [group, node]. Where `open_below`, a group's first node also carries all that lies below it, where its curves are
-    taken as constant (they are for beta <= 0); elsewhere they have vanished there.
+    [group, node]. If `open_below`, a group's first node also carries all mass below it, where its curves are taken
+    as constant (they are for beta <= 0); otherwise they have vanished there.
     """
 
     beta: jax.Array
@@ -66,7 +66,7 @@ class Layout(eqx.Module):
 
 
 def make_nodes(low, high, scale, sigma, count: int, open_below: bool = True) -> Nodes:
-    """`count` nodes on [low, high] [group], cut to what a prior Normal(1, sigma^2) reaches; scale is one number."""
+    """`count` nodes on [low, high] [group], cut to the reach of a prior Normal(1, sigma^2); scale is a scalar."""
     low = jnp.maximum(jnp.maximum(low, 1 - PRIOR_REACH * sigma), 0.0)
     high = jnp.maximum(jnp.minimum(high, 1 + PRIOR_REACH * sigma), low * (1 + 1e-9) + 1e-9)
     start, stop = jnp.arcsinh(low / scale), jnp.arcsinh(high / scale)
@@ -97,7 +97,7 @@ def _log_weights(curves, nodes: Nodes, mean, variance):
 
 @jax.custom_jvp
 def _log_sum_exp(logs):
-    """Over the nodes. Its derivative's weights are in float32: shares of a row, of which there are many."""
+    """Over the nodes. The weights of its derivative are in float32: each is a share of one of many rows."""
     return logsumexp(logs, axis=-1)
 
 
@@ -172,7 +172,7 @@ class Curves(eqx.Module):
         return jnp.where(self.layout.filled, m, mean), jnp.where(self.layout.filled, v, variance)
 
     def in_float32(self, unit) -> Curves:
-        """Rows in (beta - 1) / unit, and up to a constant for each row, which a posterior does not depend on."""
+        """Rows in (beta - 1) / unit, up to a constant for each row, which cancels in its posterior."""
         blocks = [(curves - curves.max(-1, keepdims=True), nodes.in_units(unit)) for curves, nodes in self.blocks]
         return Curves(jax.tree.map(lambda x: x.astype(jnp.float32), tuple(blocks)), self.layout)
 
@@ -196,10 +196,10 @@ def row_spectrum(exponent, sensor_rows: int, stride: int, white_share=None):
 def log_evidence_coloured(rows: Curves, spectrum):
     """Expectation-consistent log evidence of all rows, beta ~ Normal(1, circulant with eigenvalues `spectrum` [row]).
 
-    Returns [frame]; NaN where no fixed point is found, for rows that contradict the prior beyond measure.
+    Returns [frame]; NaN where no fixed point is found, because rows contradict the prior too strongly.
     """
     fixed = jax.lax.stop_gradient
-    unit = fixed(jnp.sqrt(spectrum.mean()))  # all below is in deviations of the prior from 1
+    unit = fixed(jnp.sqrt(spectrum.mean()))  # from here on, beta - 1 is in deviations of the prior
     layout, spectrum = rows.layout, spectrum / unit**2
     found = _consistent(fixed(rows).in_float32(unit), fixed(spectrum).astype(jnp.float32), FARTHEST / unit)
     change, (a, precision), (mean, variance) = jax.tree.map(lambda x: x.astype(spectrum.dtype), found)
@@ -238,8 +238,8 @@ def _consistent(rows: Curves, spectrum, farthest):
 def _step(rows: Curves, spectrum, cavity, most, farthest):
     """One step towards the fixed point from a cavity, `most` of the way: (largest change [frame], site, cavity).
 
-    Near the cavity a row's curve does what the Gaussian with its posterior does. The fixed point of these Gaussians
-    costs no look at the curves, and is where the step leads.
+    Near the cavity a row's curve acts like the Gaussian that gives the same posterior. The step leads to the fixed
+    point of these Gaussians, which is found without evaluating the curves.
     """
     layout, (mean, variance) = rows.layout, cavity
     wide = jnp.broadcast_to(variance[:, None], mean.shape)
@@ -261,8 +261,8 @@ def _step(rows: Curves, spectrum, cavity, most, farthest):
         return (state[0] < GAUSSIAN_STEPS) & (state[1] > GAUSSIAN_TOLERANCE)
 
     ahead = jax.lax.while_loop(going, gaussian_step, (0, jnp.inf * v[0, 0], cavity, (m, v)))[2]
-    # Where rows and prior disagree, curves are not Gaussian over the whole way between: no row moves further at once
-    # than a Gaussian stands for it. Cavities in natural parameters.
+    # If rows and prior disagree, curves are not Gaussian all the way between them: no row moves farther at once than
+    # its Gaussian is valid. Steps are in the natural parameters of the cavities.
     share = 1 / ahead[1] - 1 / variance
     to_go = ahead[0] / ahead[1][:, None] - mean / wide
     far = jnp.abs(to_go - share[:, None] * m) * v / (farthest + FARTHEST_SIGMA * jnp.sqrt(v))
@@ -281,7 +281,7 @@ def _change(cavity, ahead, v):
 
 
 def _site(posterior, cavity):
-    """What the rows add to their cavities: (a, precision) of exp(a x - precision x^2 / 2), one precision a frame."""
+    """What the rows add to their cavities: (a, precision) of exp(a x - precision x^2 / 2), one precision per frame."""
     (m, v), (mean, variance) = posterior, cavity
     spread = v.mean(-1)
     precision = jnp.maximum(1 / spread - 1 / variance, 1e-12)
@@ -289,7 +289,7 @@ def _site(posterior, cavity):
 
 
 def _cavity(site, spectrum):
-    """What a row's neighbours and the prior say about it, Normal(mean, variance), under the sites of all rows."""
+    """What a row's neighbours and the prior say about it, Normal(mean, variance), given the sites of all rows."""
     a, precision = site
     gain = spectrum[None, :] / (1 + precision[:, None] * spectrum[None, :])
     half = gain[:, : gain.shape[1] // 2 + 1]

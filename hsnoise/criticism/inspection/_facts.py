@@ -1,4 +1,4 @@
-"""What is read off the frames of a capture: one pass over the files, and a region of all frames kept in memory."""
+"""What is measured on the frames of a capture: one pass over the files, and a region of all frames kept in memory."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.mosaics import looks_like_a_mosaic
 from hsnoise.frames.stack import FrameStack
 
-MOST_COUNTS = 1 << 24  # that are kept in memory
-MOST_SAMPLED = 1 << 18  # pixels of a frame that tell its level and noise
-FEWEST_ROWS = 16  # of a frame that are kept, however many there are
-READERS = 2  # frames that are decoded at a time
-CORE = (0.01, 0.99)  # quantiles that a level is the mean between
+MOST_COUNTS = 1 << 24  # kept in memory
+MOST_SAMPLED = 1 << 18  # pixels of a frame that determine its level and noise
+FEWEST_ROWS = 16  # kept of a frame, however many frames there are
+READERS = 2  # frames decoded at a time
+CORE = (0.01, 0.99)  # quantiles between which a level is the mean
 FAR = 5.0  # deviations beyond which a difference is a cosmic ray
-HOT = 0.999  # quantile of pixels that are called hot
+HOT = 0.999  # quantile above which pixels are called hot
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FrameFacts:
 class GroupFacts:
     """One exposure group and its frames.
 
-    temporal_dn: noise of a pixel over time, DN; NaN of one frame. hot_dn: how far the hottest 0.1 % of the pixels lie
+    temporal_dn: noise of a pixel over time, DN; NaN for one frame. hot_dn: how far the hottest 0.1 % of the pixels lie
     above the median, DN. mosaic: whether the pixels of 2 x 2 blocks differ. step_dn: all counts are multiples of it,
     apart from an offset.
     """
@@ -98,7 +98,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Of a frame: strips of overscan, what is left without them, and the region that is kept in memory."""
+    """Parts of a frame: strips of overscan, the rest of the frame, and the region that is kept in memory."""
 
     strips: tuple[Strip, ...]
     lit: tuple[slice, slice]
@@ -123,10 +123,10 @@ def facts_of(stack: FrameStack, tick: Callable[[], Any]) -> Facts:
 
 
 def _parts_of(stack: FrameStack) -> _Parts:
-    """Kept are all columns but overscan, and as many central rows as fit."""
+    """The parts of each frame; all columns except overscan are kept, and as many central rows as fit."""
     try:
         strips = tuple(find(stack))
-    except ValueError:  # a frame that cannot be used is named when all are read
+    except ValueError:  # unusable frames are reported once all are read
         strips = ()
     (first, end), (left, right) = without(stack.shape, strips)
     most = MOST_COUNTS // (sum(stack.n_frames) * (right - left)) // 2 * 2
@@ -180,7 +180,7 @@ def _of_frame(frame: np.ndarray, stack: FrameStack, i: int, number: int, parts: 
 def _of_group(stack: FrameStack, i: int, counts: np.ndarray, facts: list[dict[str, Any]]) -> GroupFacts:
     """Facts of the frames of a group, whose region is `counts` [frame, row, column]."""
     flat = counts.reshape(len(counts), -1)
-    sample = flat[:, :: max(1, flat.shape[1] // MOST_SAMPLED) | 1].astype(np.float32)  # odd: all colours are met
+    sample = flat[:, :: max(1, flat.shape[1] // MOST_SAMPLED) | 1].astype(np.float32)  # odd, to include all colours
     levels = _levels(sample)
     noise, temporal = _noise(sample, levels)
     codes, mean = np.unique(sample[0]).astype(np.int64), sample.mean(0)
@@ -207,9 +207,9 @@ def _levels(sample: np.ndarray) -> np.ndarray:
 
 
 def _noise(sample: np.ndarray, levels_dn: np.ndarray) -> tuple[np.ndarray, float]:
-    """Noise of each frame [frame] and of a pixel over time, DN; NaN of one frame.
+    """Noise of each frame [frame] and of a pixel over time, DN; NaN for one frame.
 
-    A frame is compared with the mean of the others, whose noise is taken off; cosmic rays are clipped.
+    A frame is compared with the mean of the others, whose noise is subtracted; cosmic rays are clipped.
     """
     n = len(sample)
     if n < 2:

@@ -1,4 +1,4 @@
-"""A first look at the gain of flats, and at where counts end."""
+"""A first estimate of the gain from flats, and of where counts clip or saturate."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from hsnoise._core.types import StatedGain
 from hsnoise.criticism.budget import BudgetRow, NoiseBudget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 
-CLIPPED = 1e-4  # share of counts at 0 or at white that is named
+CLIPPED = 1e-4  # share of counts at 0 or at white that is reported
 SATURATED = 1e-3  # share of pixels at the highest count
-PRECISE = 0.05  # relative error of the gain of a level that counts
-LOW_SIGNAL = 0.05, 0.5  # of the brightest level, between which the gain is read off: brighter ones may be bent
-BRIGHT = 0.7  # of the brightest level, where bending is looked for: beyond, sensors saturate
+PRECISE = 0.05  # largest relative error of the gain of a level that is used
+LOW_SIGNAL = 0.05, 0.5  # of the brightest level, between which the gain is measured: above, the response may bend
+BRIGHT = 0.7  # of the brightest level, where the response is tested for bending: above, sensors saturate
 BENT = 0.1  # of the gain at low signal
 DISAGREES = 0.1  # of the gain that a header states
-NEAR_LIGHT = 1.5  # ratio of signals of two single frames that are compared
+NEAR_LIGHT = 1.5  # largest ratio of the signals of two single frames that are compared
 FAR = 4.0  # deviations beyond which a difference of pixels is dust or a cosmic ray
-NAMED = 4  # groups of one finding that are named
+NAMED = 4  # groups named in one finding
 
 
 @dataclass(frozen=True)
 class Gain:
-    """A gain of flats, DN/e-, where it comes from, and variance over signal of bright ones."""
+    """The gain from flats, DN/e-, its source, and variance over signal of bright flats."""
 
     dn_per_e: float
     source: str
@@ -46,9 +46,9 @@ class _Level:
 
 
 def gain_of_flats(dark: NoiseBudget | None, lit: NoiseBudget | None, facts: Facts) -> Gain | None:
-    """Photon transfer of flats of a mono or of the green of a Bayer sensor against the shortest dark.
+    """Photon transfer of flats against the shortest dark, for a mono sensor or the green of a Bayer sensor.
 
-    Of flats in pairs, or of single frames of about the same light; at low signal, where the response is straight.
+    From flats in pairs, or single frames of about the same light; at low signal, where the response is linear.
 
     Args:
         dark, lit: budgets of the darks and of the flats; facts: those of the flats.
@@ -62,9 +62,9 @@ def gain_of_flats(dark: NoiseBudget | None, lit: NoiseBudget | None, facts: Fact
     zero = min(several, key=lambda row: row.exposure_s)
     flats = [row for row in lit.rows if row.kind == "flat" and row.channel == channel]
     levels = [_level(row, zero) for row in flats if row.n_frames > 1]
-    source = "flats of several frames"
+    source = "repeated flats"
     if not _precise(levels) and channel == "mono":
-        levels, source = _pairs(facts, zero), "flats of one frame, compared in pairs"
+        levels, source = _pairs(facts, zero), "single flats, compared in pairs"
     levels = _precise(levels)
     if not levels:
         return None
@@ -88,9 +88,9 @@ def _level(row: BudgetRow, zero: BudgetRow) -> _Level:
 
 
 def _pairs(facts: Facts, zero: BudgetRow) -> list[_Level]:
-    """Single frames of one exposure and about one light, two by two; each is scaled to the mean of both.
+    """Pairs of single frames of the same exposure and about the same light; each is scaled to the mean of both.
 
-    Differences of neighbouring columns are free of gradients of the light, but not of all of the fixed pattern.
+    Differences of neighbouring columns remove gradients of the light, but not all of the fixed pattern.
     """
     if facts.region is None:
         return []
@@ -113,7 +113,7 @@ def _pairs(facts: Facts, zero: BudgetRow) -> list[_Level]:
 
 
 def about_gain(gain: Gain | None, stated: StatedGain | None) -> list[str]:
-    """Whether the gain that a header states agrees with that of the flats, and whether that falls with the light."""
+    """Whether the header's gain agrees with that of the flats, and whether the latter falls with the light."""
     if gain is None:
         return []
     said = []
@@ -121,12 +121,12 @@ def about_gain(gain: Gain | None, stated: StatedGain | None) -> list[str]:
         fall = f"from {gain.dn_per_e:.3g} to {gain.bright_dn_per_e:.3g} DN/e-"
         said.append(
             f"Variance over signal of the flats falls {fall} as they get brighter: the response bends, charge spreads,"
-            " or they saturate; dim flats tell the gain"
+            " or they saturate; dim flats determine the gain"
         )
     if stated is None:
         return said
     if abs(gain.dn_per_e / stated.value_dn_per_e - 1) > DISAGREES:
-        return [*said, f"The header states {stated.source}, but the flats say {gain}: the header is wrong or nominal"]
+        return [*said, f"The header states {stated.source}, but the flats give {gain}: the header is wrong or nominal"]
     return [*said, f"The header's {stated.source} agrees with the flats: {gain}"]
 
 
@@ -143,7 +143,7 @@ def clipping(groups: Sequence[GroupFacts], white_known: bool) -> list[str]:
     highest = {frame.highest_dn for g in groups for frame in g.frames if frame.highest_share > SATURATED}
     if not white_known and len(highest) == 1 and any(group.kind == "flat" for group in groups):
         said.append(
-            f"Many pixels end at {highest.pop()} DN: if that is where counts saturate, give it as"
+            f"Many pixels reach exactly {highest.pop()} DN: if counts saturate there, give it as"
             f" {setting('white_level')}"
         )
     return said

@@ -1,4 +1,4 @@
-"""Frames that do not belong where they are, in sentences."""
+"""Sentences about frames that look out of place."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 
 FAR = 6.0  # robust deviations from which a frame is odd
-LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least so much, in DN and of a pixel's noise
-LIT = 1.0  # of a pixel's noise, from which a level is no wandering black level
+LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least this, in DN and in units of a pixel's noise
+LIT = 1.0  # in units of a pixel's noise: a larger shift is not a wandering black level
 SIGNIFICANT = 4.0  # standard errors of a drift
-FEWEST = 5  # frames that tell a drift
+FEWEST = 5  # frames that can show a drift
 QUIETER, NOISIER = 0.7, 1.4  # of the usual noise of a frame
 AVERAGED = 0.6  # of the variance of a shorter exposure
-UNEXPLAINED_DN_PER_E = 50.0  # a gain that no sensor has: variance that grows without signal
+UNEXPLAINED_DN_PER_E = 50.0  # no sensor has such a gain: variance grows without signal
 BRIGHTER = 1.3  # hot pixels of a shorter exposure against a longer one's
 FLICKER = 0.02  # of a flat's level
 OFF_LINE = 0.05  # of the light of flats
@@ -56,7 +56,7 @@ def _identical(groups: Sequence[GroupFacts]) -> list[str]:
 
 
 def _levels(group: GroupFacts, darks: Sequence[GroupFacts]) -> Iterator[str]:
-    """Frames off the level of the others, drift and settling."""
+    """Frames whose level differs from the others, drift and settling."""
     levels = group.levels_dn
     if group.kind == "flat":
         spread = np.ptp(levels) / max(np.mean(levels), 1.0)
@@ -84,7 +84,7 @@ def _odd_level(group: GroupFacts, j: int, off_dn: float, darks: Sequence[GroupFa
         if other is not group and apart > 2 * LEAST_DN and abs(other.level_dn - level) < 0.1 * apart:
             return f"{where} others, at the level of the {other.name}: is its exposure right?"
     if off_dn > LIT * group.temporal_dn:
-        return f"{where} others: light got in, or it is of another exposure or temperature; leave it out"
+        return f"{where} others: light got in, or its exposure or temperature differs; leave it out"
     if j == 0:
         return f"{where} later ones: the black level settles after a pause; leave the first frame out"
     return f"{where} others: the black level jumps"
@@ -105,7 +105,7 @@ def _drift(group: GroupFacts, usual: np.ndarray) -> Iterator[str]:
 
 
 def _line(levels: np.ndarray) -> np.ndarray:
-    """A straight line through levels [frame] that single frames do not move: median of slopes, median of the rest."""
+    """A straight line through levels [frame], robust to single frames: median of slopes, median of the rest."""
     number = np.arange(len(levels))
     first, second = np.triu_indices(len(levels), 1)
     slope = np.median((levels[second] - levels[first]) / (second - first))
@@ -113,21 +113,21 @@ def _line(levels: np.ndarray) -> np.ndarray:
 
 
 def _noises(group: GroupFacts) -> Iterator[str]:
-    """Frames of less or more noise than the others."""
+    """Frames with less or more noise than the others."""
     if len(group.frames) < 3:
         return
     for frame in group.frames:
         ratio = frame.noise_dn / max(group.temporal_dn, 1e-6)
         if ratio < QUIETER:
-            yield f"{frame.name} ({group.name}) has {ratio:.2f} of the noise of the others: an average of frames?"
+            yield f"{frame.name} ({group.name}) has {ratio:.2f} times the noise of the others: an average of frames?"
         elif ratio > NOISIER:
-            yield f"{frame.name} ({group.name}) has {ratio:.1f} times the others' noise: of another gain or light?"
+            yield f"{frame.name} ({group.name}) has {ratio:.1f} times the noise of the others: another gain, or light?"
 
 
 def _order(groups: Sequence[GroupFacts]) -> Iterator[str]:
     names = [group.name for group in groups if group.in_time != group.frames]
     if names:
-        yield f"By the times in their headers, the files of the {', '.join(names)} are not named in order of time"
+        yield f"The file names of the {', '.join(names)} are not in the order of the times in their headers"
 
 
 def _averaged(darks: Sequence[GroupFacts]) -> Iterator[str]:
@@ -150,7 +150,7 @@ def _averaged(darks: Sequence[GroupFacts]) -> Iterator[str]:
 
 
 def _lit(darks: Sequence[GroupFacts]) -> Iterator[str]:
-    """Darks whose pixels all rise alike, which dark current does not do."""
+    """Darks whose pixels all rise by the same amount, unlike with dark current."""
     if len(darks) < 2:
         return
     first = min(darks, key=lambda group: group.level_dn)
@@ -165,7 +165,7 @@ def _lit(darks: Sequence[GroupFacts]) -> Iterator[str]:
 
 
 def _swapped(darks: Sequence[GroupFacts]) -> Iterator[str]:
-    """Pairs of groups whose hot pixels say the opposite of their exposure."""
+    """Pairs of groups whose hot pixels contradict their exposures."""
     for i, short in enumerate(darks):
         for long in darks[i + 1 :]:
             noise = 2 * np.nan_to_num(max(short.temporal_dn, long.temporal_dn), nan=0.0)
@@ -184,7 +184,7 @@ def _unlit(groups: Sequence[GroupFacts]) -> Iterator[str]:
 
 
 def _off_line(groups: Sequence[GroupFacts]) -> Iterator[str]:
-    """Flats off the line of the others, if most lie on one: light in proportion to exposure."""
+    """Flats whose light is not proportional to exposure, if that of most others is."""
     flats = [group for group in groups if group.kind == "flat" and group.exposure_s > 0]
     if len(flats) < 4:
         return
@@ -195,6 +195,6 @@ def _off_line(groups: Sequence[GroupFacts]) -> Iterator[str]:
     if off.sum() <= len(flats) // 4:
         for group, one in zip(np.array(flats, object)[off], rate[off], strict=True):
             yield (
-                f"The {group.name} hold {one / np.median(rate):.2f} times the light that the others' exposure tells:"
+                f"The {group.name} hold {one / np.median(rate):.2f} times the light expected from the other flats:"
                 " another lamp, or a wrong exposure?"
             )

@@ -21,7 +21,7 @@ HOTTER_DN, HOTTER = 5.0, 1.5  # by which hot pixels rise
 
 @dataclass(frozen=True)
 class Judgement:
-    """Sentences about what can and cannot be had, the verdict, and the next capture worth taking."""
+    """Sentences about what can and cannot be determined, the verdict, and the next capture worth taking."""
 
     determined: tuple[str, ...]
     verdict: str
@@ -32,7 +32,7 @@ class Judgement:
 def judged(
     facts: Facts, elsewhere: Facts | None, budget: NoiseBudget | None, gain: Gain | None, is_mosaic: bool
 ) -> Judgement:
-    """What can be had from these frames."""
+    """What can be determined from these frames."""
     darks = [group for group in facts.groups if group.kind == "dark"]
     flats = [group for one in (facts, elsewhere) if one is not None for group in one.groups if group.kind == "flat"]
     repeated = [group for group in darks if group.n_frames > 1]
@@ -47,13 +47,13 @@ def judged(
     if against:
         return Judgement(determined, f"A fit makes no sense: {against[0]}.", False, following)
     has_gain = gain is not None or relative < CERTAIN
-    what = "gain, read noise in electrons" if has_gain else "noise in DN, but no gain: nothing in electrons"
-    current = " and dark current" if has_gain and relative < ROUGH else ""
-    return Judgement(determined, f"A fit makes sense: it tells {what}{current}.", True, following)
+    what = "gain and read noise in electrons" if has_gain else "noise in DN, but no gain: nothing in electrons"
+    current = ", and dark current" if has_gain and relative < ROUGH else ""
+    return Judgement(determined, f"A fit makes sense: it gives {what}{current}.", True, following)
 
 
 def growth_error(budget: NoiseBudget | None) -> float:
-    """Relative standard error of the growth of the temporal variance of darks, the least of all colours; inf: none.
+    """Relative standard error of the growth of the darks' temporal variance, smallest over colours; inf if none.
 
     Growth without a rise of the mean counts only if it is beyond doubt: the camera may subtract its dark current.
     """
@@ -92,7 +92,7 @@ def _against_a_fit(
         return "no frame can be used", "Raw frames, neither averaged nor calibrated nor scaled."
     if not repeated and not any(group.n_frames > 1 for group in flats) and len(flats) < 2:
         return (
-            "no exposure has two frames, so that noise and fixed pattern cannot be told apart",
+            "no exposure has two frames, so noise and fixed pattern cannot be separated",
             "The same exposures again, eight frames of each.",
         )
     if not darks and not flats:
@@ -102,13 +102,13 @@ def _against_a_fit(
         return "most of the darks are clipped at 0", "The same darks with a higher offset (black level) of the camera."
     prints = [frame.fingerprint for group in facts.groups for frame in group.frames]
     if len(set(prints)) <= len(facts.groups) and len(prints) > len(facts.groups):
-        return "the frames of each exposure are copies of one", "Frames that were each exposed anew."
+        return "the frames of each exposure are copies of one", "Frames with a separate exposure each."
     if repeated and all(group.temporal_dn < 1e-3 for group in repeated):
         return "nothing changes from frame to frame", "Raw frames, at a higher gain if the noise is below one count."
     if is_mosaic:
         return (
             "a colour mosaic is read as mono",
-            f"The same frames with their Bayer order: {setting('cfa', 'RGGB')}, say.",
+            f"The same frames with their Bayer order, for example {setting('cfa', 'RGGB')}.",
         )
     return None
 
@@ -128,21 +128,21 @@ def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool) -> str:
     if not repeated:
         return "Read noise: no; no dark exposure has two frames"
     first = min(repeated, key=lambda group: group.exposure_s)
-    unit = "in DN and in electrons" if has_gain else "in DN only, since no gain follows"
+    unit = "in DN and in electrons" if has_gain else "in DN only, since the gain is unknown"
     return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN"
 
 
 def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> str:
     exposures = {group.exposure_s for group in repeated}
     if len(exposures) < 2:
-        return "Dark current: no; that needs darks of two exposures at least"
+        return "Dark current: no; it needs darks of at least two exposures"
     first, last = min(repeated, key=lambda g: g.exposure_s), max(repeated, key=lambda g: g.exposure_s)
     if relative >= ROUGH and last.hot_dn > max(HOTTER * first.hot_dn, first.hot_dn + HOTTER_DN):
-        return "Dark current: of hot pixels, which grow with exposure; most pixels hardly do"
+        return "Dark current: only of hot pixels, which grow with exposure; most pixels hardly do"
     if relative >= ROUGH:
-        return "Dark current: at most a bound; neither mean nor noise grow clearly with exposure"
+        return "Dark current: at most an upper bound; neither mean nor noise clearly grows with exposure"
     if last.level_dn <= first.level_dn:
-        return "Dark current: what the camera does not subtract; the mean does not rise"
+        return "Dark current: only what the camera does not subtract; the mean does not rise"
     rise = (last.level_dn - first.level_dn) / (last.exposure_s - first.exposure_s)
     return f"Dark current: yes; most pixels rise by about {rise:.2g} DN/s"
 
@@ -154,21 +154,21 @@ def _next_capture(
     repeated: Sequence[GroupFacts],
     relative: float,
 ) -> str:
-    """The one capture that would tell most."""
+    """The single most informative capture."""
     if gain is None and relative >= CERTAIN:
-        return "Flats: two to four frames at each of five brightnesses up to half of saturation; they tell the gain."
+        return "Flats: two to four frames at each of five brightnesses up to half of saturation; they give the gain."
     if not repeated:
         return "Darks: bias frames (0 s) and two longer exposures, eight frames of each."
     single = [group.name for group in darks if group.n_frames == 1]
     if single:
-        return f"More frames of the {', '.join(single)}: one frame tells no noise; eight are good."
+        return f"More frames of the {', '.join(single)}: one frame cannot show noise; eight are good."
     if len({group.exposure_s for group in darks}) < 2:
         return "Darks of a long exposure (30 to 300 s on a cooled camera), eight frames: dark current and hot pixels."
     few = [group.name for group in darks if group.n_frames < 8]
     if few:
-        return f"More frames of the {', '.join(few[:3])}: eight or more tell what changes from frame to frame."
+        return f"More frames of the {', '.join(few[:3])}: eight or more show what changes from frame to frame."
     if gain is None:
-        return "Flats in pairs at five brightnesses: they would confirm the gain that the darks tell."
+        return "Flats in pairs at five brightnesses: they would confirm the gain from the darks."
     if relative >= ROUGH:
         return "Longer darks, until their noise grows: dark current and hot pixels would show."
     return "More of the same would only sharpen the numbers; 32 frames of each exposure show rare and small effects."

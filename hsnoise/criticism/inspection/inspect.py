@@ -24,7 +24,7 @@ from hsnoise.statistics.decomposition import COMPONENTS, Component
 
 MOST_ROWS = 12  # of the printed budget
 HEADINGS = ("kind", "exposure / s", "frames", "degrees C", "level / DN", "noise / DN", "top 0.1 % / DN")
-FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is named
+FALLS = 0.01  # of the signal: how far an overscan may follow the light before it is reported
 FEW_CODES = 0.5  # DN of noise below which counts are too coarse
 
 
@@ -40,7 +40,7 @@ class Inspection:
         verdict: whether a fit makes sense, and why.
         fit_makes_sense: the same as a bool.
         next_capture: which capture is worth taking next.
-        budget: the noise budget of a region of the frames; None if there are none that can be used.
+        budget: the noise budget of a region of the frames; None if no frame can be used.
     """
 
     stack: FrameStack
@@ -61,7 +61,7 @@ class Inspection:
 
     @property
     def parts(self) -> dict[str, tuple[str, ...]]:
-        """What is printed, in lines: the capture, its groups, what is odd, the budget, what can be had, what next."""
+        """The printed lines: capture, groups, what is odd, budget, what can be determined, what to capture next."""
         return {
             "capture": (size_of(self.stack), f"  {levels_of(self.stack)}"),
             "groups": _table(self.groups),
@@ -111,8 +111,8 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         keywords: those of `load` for a path, those of FrameStack for an array.
 
     Raises:
-        FileNotFoundError, TypeError, ValueError: whatever `load` or `FrameStack` refuse. Frames whose values are wrong
-            are named instead.
+        FileNotFoundError, TypeError, ValueError: as `load` or `FrameStack` raise. Frames with wrong values are reported
+            instead.
     """
     tick = callback("progress", progress)
     stack = as_stack(path_or_stack, **keywords)
@@ -137,7 +137,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
     if is_mosaic:
         findings.append(
             "Read as mono, but the pixels of each 2 x 2 block differ: a colour sensor?"
-            f" Give {setting('cfa', 'RGGB')}, say"
+            f" If so, give its Bayer order, for example {setting('cfa', 'RGGB')}"
         )
     return Inspection(
         stack=stack,
@@ -156,22 +156,22 @@ def _budget(facts: Facts | None) -> NoiseBudget | None:
 
 
 def _coarse(groups: tuple[GroupFacts, ...]) -> list[str]:
-    """Counts that a converter of fewer bits made, and noise of less than a count."""
+    """Counts scaled up from fewer bits, and noise of less than a count."""
     said = []
     steps = {group.step_dn for group in groups}
     if len(steps) == 1 and max(steps) > 1:
-        said.append(f"All counts are multiples of {max(steps)}, apart from an offset: fewer bits were scaled up")
+        said.append(f"All counts are multiples of {max(steps)}, apart from an offset: scaled up from fewer bits")
     fine = [group for group in groups if group.kind == "dark" and group.temporal_dn < FEW_CODES]
     if fine:
         said.append(
-            f"The noise of the {fine[0].name} is {fine[0].temporal_dn:.2g} DN, less than the steps between counts:"
-            " read noise will be a bound"
+            f"The noise of the {fine[0].name} is {fine[0].temporal_dn:.2g} DN, less than a step between counts:"
+            " read noise will be an upper bound"
         )
     return said
 
 
 def _overscan(stack: FrameStack, facts: Facts) -> list[str]:
-    """A black level that follows the light, by the overscan."""
+    """A black level that follows the light, as the overscan shows."""
     if stack.overscan_dn is not None:
         overscan = stack.overscan_dn[: len(facts.groups)]
     else:
@@ -199,7 +199,7 @@ def _numbers(group: GroupFacts) -> tuple[str, float, int, float, float, float, f
 
 
 def _cells(group: GroupFacts) -> tuple[str, ...]:
-    """What HEADINGS say of a group, as text."""
+    """The values of a group under HEADINGS, as text."""
     kind, exposure_s, n_frames, temperature_c, level_dn, noise_dn, hot_dn = _numbers(group)
     temperature = "-" if np.isnan(temperature_c) else f"{temperature_c:.1f}"
     noise = "-" if np.isnan(noise_dn) else f"{noise_dn:.4g}"
@@ -207,7 +207,7 @@ def _cells(group: GroupFacts) -> tuple[str, ...]:
 
 
 def _table(groups: tuple[GroupFacts, ...]) -> tuple[str, ...]:
-    """Headings and a line for each group, in columns as wide as the headings at least."""
+    """Headings and a line for each group, in columns at least as wide as the headings."""
     widths = [len(heading) for heading in HEADINGS[1:]]
     return tuple(
         f"{kind}   " + "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
@@ -216,7 +216,7 @@ def _table(groups: tuple[GroupFacts, ...]) -> tuple[str, ...]:
 
 
 def _noise_table(found: NoiseBudget | None) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
-    """The budget as standard deviations, of groups with several frames: what it is, headings, rows."""
+    """The budget as standard deviations, for groups with several frames: title, headings, rows."""
     rows = [] if found is None else [row for row in found.rows if row.n_frames > 1]
     has_colours = len({row.channel for row in rows}) > 1
     shown = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, min(MOST_ROWS, len(rows))).astype(int))]
@@ -239,7 +239,7 @@ def _noise_lines(found: NoiseBudget | None) -> tuple[str, ...]:
 
 
 def _cell(component: Component) -> str:
-    """Standard deviation, DN, or what it is below."""
+    """Standard deviation, DN, or its upper bound."""
     value, error = component.variance_dn2, component.standard_error_dn2
     if not np.isfinite(value):
         return "-"

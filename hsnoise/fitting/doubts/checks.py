@@ -28,7 +28,7 @@ from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
 
 __all__ = ["Evidence", "carries_no_gain", "checked", "confirmed"]
 
-OPEN = 1.0  # relative error of a gain from which it counts as unknown
+OPEN = 1.0  # relative error of a gain above which it counts as unknown
 ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks long enough for their signal to show."
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
@@ -113,7 +113,7 @@ def _named_noise(found: Survey) -> str:
 
 
 def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
-    """Where pixels leave the photon transfer line, and where flats and darks disagree."""
+    """Where pixels deviate from the photon transfer line, and where flats and darks disagree."""
     pixel = result.transfer
     if pixel is None:
         return
@@ -161,8 +161,9 @@ def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
     """Darks without two frames at any exposure, which cannot show whether pixels differ."""
     if found.darks and all(g.n_frames < 2 for g in found.darks):
         yield (
-            "Each exposure has one dark frame, so differences between pixels cannot be distinguished from noise; they"
-            " can make gain and read noise wrong by large factors. Take two frames of each exposure, better eight."
+            "Each exposure has one dark frame, so differences between pixels cannot be distinguished from noise and"
+            " can make gain and read noise wrong by large factors. Take at least two frames of each exposure, better"
+            " eight."
         )
 
 
@@ -173,9 +174,9 @@ def _by_shape_alone(result: FitResult) -> Iterator[str]:
         return
     if np.unique(summary.exposure_s).size == 1:
         yield (
-            "All darks have one exposure, so that the gain rests on the shape of their distribution and on how rows"
-            " differ, and other skewed noise or row noise would change it as well. Confirm it by a pair of flats, or"
-            " darks of a second exposure."
+            "All darks have one exposure, so the gain rests on the shape of their distribution and on how rows differ;"
+            " other skewed noise or row noise would change it as well. Confirm it with a pair of flats, or darks of a"
+            " second exposure."
         )
 
 
@@ -216,12 +217,12 @@ def _many_hot(result: FitResult) -> Iterator[str]:
     if share > MANY_HOT:
         yield (
             f"{100 * share:.2g} % of the pixels came out as hot: dark currents are not log-normal with a few hot pixels"
-            " above. The model's mean over all pixels is right, but its distribution is rough."
+            " above. The model's mean over all pixels is right, but its distribution is only rough."
         )
 
 
 def _outliers(result: FitResult) -> Iterator[str]:
-    """Pixels that were excluded because they have an outlier in some frame."""
+    """Pixels that were excluded because of an outlier in some frame."""
     pixel = result.transfer
     for channel in pixel.channels if pixel is not None else ():
         share = 0.0 if channel.transfer is None else float(channel.transfer.classes.outlier_share.max())

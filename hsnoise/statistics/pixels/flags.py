@@ -11,7 +11,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
 DIM = 0.5  # of the median response of its neighbours: below it a pixel is dead
-LIT_SIGMAS = 5.0  # of the noise of a level, of a signal below which no light falls
+LIT_SIGMAS = 5.0  # a signal below this, in units of a level's noise, is no light
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
 
 
@@ -41,7 +41,7 @@ def counts_of(flags: np.ndarray) -> dict[str, float]:
 
 
 def _dead(found: Survey, channel: int) -> np.ndarray:
-    """Pixels that hardly respond to light, or are where none falls, as overscan is.
+    """Pixels that hardly respond to light, or lie where none falls, such as overscan.
 
     They are compared with their neighbours in the row: light may fall off by any factor over a frame.
     """

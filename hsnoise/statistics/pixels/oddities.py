@@ -42,8 +42,8 @@ def _frames(found: Survey) -> Iterator[str]:
         for f in () if lit else np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
             side = "brighter" if off[f] > 0 else "darker"
             yield (
-                f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or of"
-                " another exposure or temperature? Leave it out."
+                f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or"
+                " taken at another exposure or temperature? Leave it out."
             )
         for f in np.flatnonzero(noise < (1 - ODD_NOISE) * pixel):
             yield (
@@ -59,7 +59,7 @@ def _lines(found: Survey) -> Iterator[str]:
             return  # rows with a single count are normal here
         for what, lines in (("rows", odd.constant_rows), ("columns", odd.constant_columns)):
             if len(lines):
-                yield f"{_listed(what, lines)} have one count only: they are dead, or padding. Crop them (roi)."
+                yield f"{_listed(what, lines)} have a single count: they are dead, or padding. Crop them (roi)."
         if len(odd.repeated_rows):
             yield f"{_listed('rows', odd.repeated_rows)} repeat the row before: they are padding. Crop them (roi)."
 
@@ -110,8 +110,8 @@ def lit_darks(found: Survey) -> Iterator[str]:
             spread = np.sqrt(max(common, 0.0)) / max(rise, 1e-9)
             if rise > max(LIT_DN, LIT_NOISES * group.noise_dn) and LEAST_SPREAD < spread and width < MOST_SPREAD * rise:
                 yield (
-                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN with a spread of only {spread:.2g}"
-                    f" of it: dark currents differ by more. Did light get in, or are they flats"
+                    f"The pixels{of} of the {name_of(group)} rise by {rise:.3g} DN with a spread of only"
+                    f" {spread:.2g} of that: dark currents differ by more. Did light get in, or are they flats"
                     f" ({setting('kind', 'flat')})?"
                 )
                 break

@@ -28,9 +28,9 @@ APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by
 SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ in dark current
 LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
-MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and where it counts as none
+MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and the logit that stands for none
 HOT_FROM = 2.0  # mean extra of hot pixels, over the mean of the others
-WARM_SIGMAS = 6.0  # of the levels below the median
+WARM_SIGMAS = 6.0  # in units of the noise of the levels, from those below the median
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
 
@@ -90,7 +90,7 @@ def population_of(
     cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
     beyond = body - cut if spread > 0 or fraction > 0 else 0.0
     mean = ordinary + beyond
-    if fraction > 0:  # keeps the tail's charge for any shape of it; moving pedestals are in both means
+    if fraction > 0:  # keeps the charge of the tail, whatever its shape; moving pedestals are in both means
         total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
         measured = float(growth[growth < limit - pedestal_dn_per_s].mean()) + beyond
         rate = max((total - measured) / fraction, 0.0)
@@ -121,8 +121,8 @@ class Warm(NamedTuple):
 def warm_of(halves: np.ndarray, columns: int) -> Warm | None:
     """The warm pixels of one exposure; None where there are none.
 
-    halves [half, pixel]: levels of pixels of rows of so many columns. What neighbours share, shading as well, is no
-    extra. Without a second exposure nothing tells charge of the exposure from charge of the readout.
+    halves [half, pixel]: levels of pixels in rows of `columns`. What neighbours share, such as shading, is not an extra
+    level. Without a second exposure, charge of the exposure cannot be distinguished from charge of the readout.
     """
     off = np.stack([half - of_neighbours(half, columns) for half in halves]).astype(np.float64)
     extra = off.mean(0) - np.median(off.mean(0))
@@ -163,7 +163,7 @@ def growth_cdf(
     else:  # narrow noise would leave steps between the nodes of the log-normal distribution
         left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
         plain = ndtr(np.log(left) / spread + spread / 2) @ weight
-    if fraction > 0 and tail > 0:  # beside so wide an extra, what is ordinary in hot pixels counts as normal
+    if fraction > 0 and tail > 0:  # next to so wide an extra, the ordinary part of hot pixels can be taken as normal
         width = np.hypot(noise, spread * mean)
         z, weight = normal_nodes(TAIL_NODES)
         off = (x[:, None] - mean) / width
@@ -212,7 +212,7 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     cool = _refit(loss, np.append(theta[:2], [COOL, theta[3]]), 2)
     found = natural(theta)
     there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
-    # Many pixels that are hardly warmer than the others are the tail of the others.
+    # Many pixels that are hardly warmer than the others are their tail, not hot pixels.
     if not there or found[3] < HOT_FROM * found[0] or found[2] > 0.95 * MOST_HOT:
         theta = cool
     values = np.array(natural(theta))
@@ -234,8 +234,8 @@ def _with_tail(loss, theta: np.ndarray) -> np.ndarray:
 
 
 def _least(loss, theta: np.ndarray) -> np.ndarray:
-    """The numbers of the lowest loss, from `theta`."""
-    for _ in range(2):  # a simplex that has shrunk on the way begins anew
+    """The numbers with the lowest loss, starting from `theta`."""
+    for _ in range(2):  # restarts, because the simplex may have shrunk too early
         theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
     return theta
 
@@ -249,7 +249,7 @@ def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
 
 
 def _refit(loss, theta: np.ndarray, held: int) -> np.ndarray:
-    """The numbers of the lowest loss with one of them fixed."""
+    """The numbers with the lowest loss, one of them fixed."""
     free = [i for i in range(len(theta)) if i != held]
 
     def whole(some: np.ndarray) -> np.ndarray:
@@ -276,7 +276,7 @@ def _errors(loss, theta: np.ndarray) -> np.ndarray:
 
 
 def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
-    """Standard deviation of offsets from two halves of the frames [half, pixel], without the part of dark current.
+    """Standard deviation of offsets from two halves of the frames [half, pixel], without the part due to dark current.
 
     At most that of the pixels below the median: warm pixels are not normal offsets.
     """

@@ -1,4 +1,4 @@
-"""How much the read noise of pixels differs: two temporal variances of each pixel, which go together if it does."""
+"""How much the read noise of pixels differs: if it does, two temporal variances of each pixel are correlated."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
 MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
-SURE = 8.0  # standard errors from which quiet pixels differ: telegraph noise that is not cut reaches 5
-NOISIEST = 0.05  # share of the pixels that jump or are hit, at most
+SURE = 8.0  # standard errors above which quiet pixels differ: telegraph noise that is not cut reaches 5
+NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
 
 
 def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[float, float]:
-    """Standard deviation of the logarithm of read noise over pixels, and its error; infinite where nothing tells.
+    """Standard deviation of the logarithm of read noise over pixels, and its error; infinite if undetermined.
 
     read_dn2: mean square of the read noise, DN^2.
 
-    From the covariance of two temporal variances of each pixel, less what goes with its level and dark signal (shot
-    noise). Without the noisiest pixels, because those that jump or are hit have another kind of noise; log-normal read
-    noise, drawn and cut in the same way, says what is left of its covariance. If so cut the quiet pixels differ beyond
-    chance, the spread is that of all pixels but the outliers.
+    From the covariance of two temporal variances of each pixel, less what follows from its level and dark signal (shot
+    noise). First without the noisiest pixels, because those that jump or are hit have another kind of noise; log-normal
+    read noise, drawn and cut in the same way, shows how much of its covariance remains. If these quiet pixels differ
+    beyond chance, the spread is that of all pixels except outliers.
     """
     groups, moving = sorted(found.repeated_darks, key=lambda g: g.exposure_s), ~found.stuck(channel)
     if not groups or moving.sum() < FEWEST_PIXELS or read_dn2 <= 0:
@@ -40,7 +40,7 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
         return 0.0, float(np.interp(expected[0] + error, expected, spreads))
     usual = is_no_outlier(first, frames[0]) & is_no_outlier(second, frames[1])
     left, error = _together(first, second, by, usual)
-    # Read noise is only a part of all noise, and differs by more.
+    # Read noise is only part of all noise, so it differs by more.
     share = min(read_dn2 / float(np.sqrt(first[usual].mean() * second[usual].mean())), 1.0)
     spread, one_up = (float(np.sqrt(np.log1p(x / share**2)) / 2) for x in (max(left, 0.0), max(left, 0.0) + error))
     return spread, max(one_up - spread, 1e-6)
@@ -49,7 +49,7 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[flo
 def _variances(groups: list[Group], channel: int, moving: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
     """Two temporal variances of each pixel [2, pixel], DN^2, and how many frames each is from; the shortest first.
 
-    Those of two exposures, each known better than that of half of the frames, unless the second is mostly shot noise.
+    From two exposures, more precise than two halves of the frames, unless the second is mostly shot noise.
     """
     halves = groups[0].of(channel)[0].halves.n_frames
     if len(groups) > 1:
@@ -60,7 +60,7 @@ def _variances(groups: list[Group], channel: int, moving: np.ndarray) -> tuple[n
 
 
 def _together(first: np.ndarray, second: np.ndarray, by: list[np.ndarray], kept: np.ndarray) -> tuple[float, float]:
-    """Covariance of two relative variances over the pixels that are kept, less what goes with `by`, and its error."""
+    """Covariance of two relative variances over the kept pixels, less what follows from `by`, and its error."""
     a, b = (of[kept].astype(np.float64) / of[kept].mean() for of in (first, second))
     terms = (a - a.mean()) * (b - b.mean())
     explained = _explained(a, b, [one[:, kept].astype(np.float64) for one in by])
@@ -68,14 +68,14 @@ def _together(first: np.ndarray, second: np.ndarray, by: list[np.ndarray], kept:
 
 
 def _is_quiet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """All pixels but the noisiest, by two temporal variances [pixel]."""
+    """Which pixels are not among the noisiest, by two temporal variances [pixel]."""
     both = first / np.median(first) + second / np.median(second)
     return both <= np.quantile(both, 1 - NOISIEST)
 
 
 @cache
 def _of_quiet(*dof: int) -> tuple[np.ndarray, np.ndarray]:
-    """Spreads of log-normal read noise, and covariances of the relative variances of the quiet pixels, rising."""
+    """Spreads of log-normal read noise, and the covariance of the quiet pixels' relative variances for each."""
     rng = np.random.default_rng(0)
     z, chance = rng.standard_normal(SIMULATED), [rng.chisquare(n, SIMULATED) / n for n in dof]
     spreads = np.linspace(0.0, 1.2, 25)

@@ -1,7 +1,7 @@
-"""Maps without the noise of their estimation: each pixel is drawn from what is known of it, its posterior.
+"""Maps without the noise of their estimation: each pixel is drawn from its posterior.
 
-A map that keeps the noise of its estimation is too rough, and the mean of the posterior is too smooth; a draw from it
-has the spread of the truth (Louis, "Estimating a population of parameter values using Bayes and empirical Bayes
+A map with the noise of its estimation is too rough, and the mean of the posterior is too smooth; a draw from the
+posterior has the true spread (Louis, "Estimating a population of parameter values using Bayes and empirical Bayes
 methods", JASA 79, 1984). The distribution of true values over pixels is free in shape: weights on a grid, by maximum
 likelihood (Laird, "Nonparametric maximum likelihood estimation of a mixing distribution", JASA 73, 1978).
 """
@@ -12,12 +12,12 @@ import numpy as np
 from scipy.ndimage import zoom
 from scipy.stats import chi2
 
-BLOCK = 16  # pixels of a side over which the level of a map is even
-NEAR = 10.0  # errors from its surroundings, beyond which a pixel is what was measured
+BLOCK = 16  # side in pixels over which the level of a map is smooth
+NEAR = 10.0  # errors from its surroundings, beyond which a pixel keeps its measured value
 BIN, SPACING, GRID = 0.05, 0.1, 120  # in errors; points of the grid of variances
 LEAST_ERROR = 0.1  # of the expected one
 STEPS = 100  # of expectation and maximisation
-RARE = 1e-3  # weight, at first, of values anywhere
+RARE = 1e-3  # initial weight of values anywhere
 WIDEST = 12.0  # of the logarithm of a variance, beyond the typical one
 LEAST_RATIO = 1e-3  # of variances
 TINY = 1e-12
@@ -25,7 +25,7 @@ CORE = (0.1587, 0.5, 0.8413)  # quantiles at one standard deviation
 
 
 def surroundings(values: np.ndarray) -> np.ndarray:
-    """The even part of a map [row, column]: medians of blocks, interpolated."""
+    """The smooth part of a map [row, column]: medians of blocks, interpolated."""
     blocks = values
     for axis, size in enumerate(values.shape):
         parts = np.array_split(blocks, max(1, size // BLOCK), axis=axis)
@@ -42,14 +42,14 @@ def values_from_posterior(
     Args:
         estimate: measured; halves [half, row, column]: from two halves of the frames, whose covariance is free of the
             noise of estimation.
-        error: expected variance of the errors; beyond some of them from its surroundings a pixel is what was measured.
+        error: expected variance of the errors; a pixel farther than NEAR errors from its surroundings keeps its value.
     """
     even = surroundings(estimate)
     is_near = np.abs(estimate - even) < NEAR * np.sqrt(error)
     local, (a, b) = (estimate - even)[is_near], (halves - even)[:, is_near]
     width = NEAR * np.sqrt(2 * error)
     spread = max(float(np.mean(np.clip(a, -width, width) * np.clip(b, -width, width))), 0.0)
-    # What these pixels differ by beyond that is error, whatever its cause.
+    # Any difference between these pixels beyond that is error, whatever its cause.
     sigma = np.sqrt(max(float(np.mean(local**2)) - spread, LEAST_ERROR * error))
     edges = np.arange(-NEAR, NEAR + BIN, BIN) * np.sqrt(error) / sigma
     grid = np.arange(edges[0], edges[-1], SPACING)

@@ -10,8 +10,8 @@ factor of hot pixels. A pedestal moves all classes alike, so pixels of different
 pedestal does. Weighted least squares: the equation is linear in a, K, K p and K F.
 
 Hot pixels may be sub-Poisson (F from 1 to 0.5: a generation centre emits a hole, then an electron). The prior puts half
-its weight on F = 1 and spreads the other half evenly over 0.5 to 1: hot pixels count as far as ordinary pixels confirm
-them.
+its weight on F = 1 and spreads the other half evenly over 0.5 to 1, so hot pixels count only as far as ordinary pixels
+confirm them.
 
 Reference: photon transfer, Janesick 2007; equations in docs/likelihood.md.
 """
