@@ -43,7 +43,7 @@ def clean_portion(model: hsnoise.NoiseModel, seed: int) -> Portion:
 
 
 def measured(model: hsnoise.NoiseModel, captures: int, seed: int) -> dict[str, np.ndarray]:
-    """Of clean captures [capture]: error, normal score of the worst group, best score of any candidate in nats."""
+    """Of clean captures [capture]: error, largest |z|, normal score of the worst group, best score in nats."""
     portion = clean_portion(model, seed)
     bench = Bench.of(Simulator(model, portion, key_for(seed, Purpose.DIAGNOSE)), DRAWS)
     null = shrunk(bench.base.own_z(), bench.slopes())
@@ -58,6 +58,7 @@ def measured(model: hsnoise.NoiseModel, captures: int, seed: int) -> dict[str, n
         "candidates": np.array(len(makers)),
         "groups": np.array(len(set(groups))),
         "error": np.array([max(misfits(one, groups).values()) for one in z]) / typical,
+        "max_z": np.abs(z).max(1),
         "misfit": np.array([max(null.normal_scores(one, groups).values()) for one in z]),
         "score": np.max(scores, 0),
     }
@@ -69,6 +70,12 @@ def derived(found: dict[str, np.ndarray]) -> list[tuple[str, float, str]]:
     limit = rules.evidence(candidates)
     return [
         ("FITS", rules.FITS, f"99 % of right models are below {np.quantile(found['error'], 0.99):.2f}"),
+        (
+            "MAX_Z",
+            rules.MAX_Z,
+            f"99 % of right models are below {np.quantile(found['max_z'], 0.99):.2f}; the largest is"
+            f" {found['max_z'].max():.2f}",
+        ),
         (
             "MISFIT_LEFT",
             rules.MISFIT_LEFT,

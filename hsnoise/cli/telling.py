@@ -86,7 +86,7 @@ def page_of_comparison(found: Comparison) -> Page:
     return Page(
         found.conclusion,
         tables=(_plain(found.as_table()),),
-        notes=tuple(f"- {one}" for one in found.worst),
+        notes=tuple(f"- {one}" for one in (*found.worst, found.unexplained) if one),
         rest=(found.measure, *(f"- {one}" for one in sentences[len(found.worst) :])),
     )
 

@@ -17,7 +17,6 @@ from hsnoise._core.arguments import seed_of
 from hsnoise._core.keys import named_key
 from hsnoise._core.types import RandomKey
 from hsnoise.criticism import sentences, shares
-from hsnoise.criticism.budget import budget
 from hsnoise.criticism.compare import Comparison, compared
 from hsnoise.criticism.measured_curve import with_response
 from hsnoise.criticism.measured_maps import Sensor
@@ -76,9 +75,9 @@ class ClosedModel:
         return self.comparison.error < self.before.error
 
     @property
-    def largest_unexplained(self) -> Share:
-        """The component whose unexplained part is the largest of the whole variance."""
-        return max(self.shares, key=lambda share: share.unexplained_of_total)
+    def largest_unexplained(self) -> Share | None:
+        """The component of which the largest part of the whole variance is unexplained beyond chance, if any."""
+        return shares.largest_unexplained(self.shares)
 
     @property
     def summary(self) -> str:
@@ -124,7 +123,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         named=params,
         replaced=replaced,
         overshot=tuple(name for name in params.names if name not in (*replaced, *found.names)),
-        shares=shares.shares_of(params, found, judge.frames, key),
+        shares=shares.shares_of(params, judge.frames, key, closed=found),
         static=_static(params, judge.frames, key, replaced),
         comparison=compared(found, judge, seed=seed),
         before=compared(params, judge, seed=seed),
@@ -142,7 +141,7 @@ def repeated_darks(stack: FrameStack) -> FrameStack:
 
 def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tuple[str, ...]) -> str:
     longest = frames.select(exposures=[int(np.argmax(frames.exposure_s))])
-    return shares.in_words(shares.static_by_effect(named, longest, key, effects), shares.static_dn2(budget(longest)))
+    return shares.in_words(shares.static_by_effect(named, longest, key, effects), shares.static_dn2(longest))
 
 
 def _apart(darks: FrameStack) -> tuple[Apart, ...]:

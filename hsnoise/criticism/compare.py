@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
 from hsnoise._core.threads import in_threads
-from hsnoise.criticism import rules, sentences
+from hsnoise.criticism import rules, sentences, shares
+from hsnoise.criticism.shares import Share
 from hsnoise.frames.source import as_stack
 from hsnoise.likelihood.joint import log_likelihood
 from hsnoise.model import NoiseModel
@@ -40,10 +41,13 @@ class Comparison:
         groups: misfit (chi-square per degree of freedom) of each group of statistics.
         table: a row for each statistic: name, group, measured, model (mean of its draws), z.
         worst: the statistics that fail most, in words.
-        p_value: how often the model's own draws are as far off (at least 1 / (draws + 1)).
+        p_value: how often the worst group of the model's own draws is as far off (at least 1 / (draws + 1)).
         log_likelihood_per_pixel: of the capture under the model, nats; NaN for a model with effects that state no
             likelihood. It is held out if the model was fitted to other frames.
         skipped: statistics that this capture does not allow, and why.
+        max_z_p_value: how often the largest |z| of the model's own draws is as large as `max_z`.
+        shares: of each component of the noise budget of the darks, what the model does not reproduce, in per cent of
+            its variance and in DN; empty without two darks of an exposure, and for the steps of `improve`.
     """
 
     error: float
@@ -53,16 +57,28 @@ class Comparison:
     p_value: float
     log_likelihood_per_pixel: float
     skipped: tuple[str, ...]
+    max_z_p_value: float = float("nan")
+    shares: tuple[Share, ...] = ()
 
     @property
     def fits(self) -> bool:
         """Whether the capture could have been drawn from the model: its error is one that right models have."""
-        return self.error < rules.FITS
+        return rules.fits(self.error, self.max_z)
+
+    @property
+    def max_z(self) -> float:
+        """The largest |z| of all statistics: one that fails is lost in the mean of a large group."""
+        return max((abs(row[4]) for row in self.table), default=0.0)
 
     @property
     def worst_group(self) -> str:
         """The group of statistics with the largest misfit."""
         return max(self.groups, key=self.groups.__getitem__)
+
+    @property
+    def largest_unexplained(self) -> Share | None:
+        """The component of which the largest part of the whole variance is not reproduced beyond chance, if any."""
+        return shares.largest_unexplained(self.shares)
 
     @property
     def conclusion(self) -> Conclusion:
@@ -71,6 +87,8 @@ class Comparison:
             return Conclusion(Light.GREEN, sentences.describes(self.error))
         is_close = self.error < rules.CLOSE
         light = Light.AMBER if is_close else Light.RED
+        if self.error < rules.FITS:
+            return Conclusion(light, sentences.fails_in_one(self.error, self.max_z, self.worst[0]))
         return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close))
 
     @property
@@ -82,6 +100,11 @@ class Comparison:
     def measure(self) -> str:
         """What the error is, in words."""
         return sentences.measure(self.error, max(self.groups.values()), self.own_misfit)
+
+    @property
+    def unexplained(self) -> str:
+        """The largest part of the noise that the model does not reproduce, in a sentence; empty if it is not known."""
+        return "" if not self.shares else sentences.unexplained(self.largest_unexplained)
 
     def plot(self):
         """A figure of where the model fails: `hsnoise.plots.comparison`."""
@@ -108,8 +131,9 @@ class Comparison:
         console.print(str(self.conclusion), markup=False, highlight=False)
         console.print(self.measure, highlight=False)
         console.print(self.as_table())
-        for sentence in (*self.worst, *explained(self.worst), *self.skipped):
-            console.print(f"- {sentence}", highlight=False)
+        for sentence in (*self.worst, *explained(self.worst), self.unexplained, *self.skipped):
+            if sentence:
+                console.print(f"- {sentence}", highlight=False)
         return console.file.getvalue().rstrip()
 
     __repr__ = __str__
@@ -119,7 +143,8 @@ class Comparison:
             _html.conclusion(self.conclusion),
             _html.paragraph(self.measure),
             _html.printed(self.as_table()),
-            _html.sentences(self.worst),
+            _html.sentences((*self.worst, self.unexplained) if self.unexplained else self.worst),
+            "" if not self.shares else _html.details("Noise budget", _html.printed(shares.as_table(self.shares))),
             _html.details("About the statistics", _html.sentences((*explained(self.worst), *self.skipped))),
         )
 
@@ -144,7 +169,18 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     check_fits(params, stack)
     portion = Portion.of(stack)
     check_effects(params, portion.frames)
-    return compared(params, portion, draws=draws, seed=seed, tick=tick)
+    found = compared(params, portion, draws=draws, seed=seed, tick=tick)
+    return with_shares(found, params, portion, seed)
+
+
+def with_shares(found: Comparison, params: NoiseModel, portion: Portion, seed: int) -> Comparison:
+    """A comparison with the shares of the noise budget that the model does not reproduce."""
+    darks = portion.darks.frames
+    repeated = [i for i, frames in enumerate(darks.n_frames) if frames > 1]
+    if not repeated:
+        return found
+    key = key_for(seed, Purpose.SHARES)
+    return replace(found, shares=shares.shares_of(params, darks.select(exposures=repeated), key))
 
 
 def compared(
@@ -159,17 +195,24 @@ def compared(
     z = own.z(measured.values)
     groups = misfits(z, own.groups)
     worst = max(groups.values())
-    worst_of_draws = np.array([max(misfits(one, own.groups).values()) for one in own.own_z()])
+    own_z = own.own_z()
+    worst_of_draws = np.array([max(misfits(one, own.groups).values()) for one in own_z])
     table = zip(own.names, own.groups, measured.values, own.mean, z, strict=True)
     return Comparison(
         error=worst / float(np.median(worst_of_draws)),
         groups=groups,
         table=tuple((name, group, float(a), float(b), float(c)) for name, group, a, b, c in table),
         worst=_in_words(own.names, measured.values, own.mean, z),
-        p_value=float((1 + (worst_of_draws >= worst).sum()) / (draws + 1)),
+        p_value=_rank(worst_of_draws, worst),
         log_likelihood_per_pixel=per_pixel,
         skipped=(*measured.skipped, *portion.left_out),
+        max_z_p_value=_rank(np.abs(own_z).max(1), np.abs(z).max()),
     )
+
+
+def _rank(of_draws: np.ndarray, measured: float) -> float:
+    """Probability of a value as large, by its rank among draws [draw] and itself."""
+    return float((1 + (of_draws >= measured).sum()) / (len(of_draws) + 1))
 
 
 def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z: np.ndarray) -> tuple[str, ...]:

@@ -56,6 +56,22 @@ def fails(error: float, worst: str, is_close: bool) -> str:
     return f"The model {how}; {worst} is worst: error {number(error)}, {close}."
 
 
+def fails_in_one(error: float, max_z: float, worst: str) -> str:
+    """The sentence for a model whose groups of statistics fit, but not a single statistic."""
+    return f"The model fits but for one statistic, {max_z:.3g} deviations off (error {number(error)}): {worst}."
+
+
+def unexplained(worst: Share | None) -> str:
+    """The largest part of the noise that a model does not reproduce."""
+    if worst is None:
+        return "no component of the noise budget differs from the model's beyond chance"
+    much = "too little" if worst.closed_dn2 < worst.measured_dn2 else "too much"
+    return (
+        f"the noise budget differs most in {worst.component} at {seconds(worst.exposure_s)}: the model draws"
+        f" {worst.unexplained_dn:.2g} DN rms {much}, {100 * worst.unexplained_of_total:.2g} % of the variance of all"
+    )
+
+
 def measure(error: float, misfit: float, own: float) -> str:
     """What the error is: a misfit divided by the model's own."""
     return (
@@ -260,10 +276,10 @@ def added(step: int, name: str, reason: str, before: float, after: float, fell: 
     return f"Step {step}: added {name}, because {reason}; error {before:.2f} -> {after:.2f}{fell}."
 
 
-def closed(error: float, worst: Share) -> str:
+def closed(error: float, worst: Share | None) -> str:
     """How near a model closed with measured components comes."""
     head = f"Closed with measured components: error {error:.3g}"
-    if worst.unexplained == 0:
+    if worst is None:
         return f"{head}, no component of the noise differs beyond chance."
     left = f"{100 * worst.unexplained_of_total:.2g} % of the variance at {seconds(worst.exposure_s)}"
     return f"{head}; the most that it leaves unexplained is {left}, in {worst.component}."

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import norm
 
 from hsnoise._core.keys import named_key
-from hsnoise._core.types import RandomKey, seconds
-from hsnoise.criticism.budget import NoiseBudget, budget
+from hsnoise._core.types import RandomKey, cfa_tile, seconds
+from hsnoise.criticism import rules
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import draw_capture
-from hsnoise.statistics.decomposition import COMPONENTS, STATIC, Component
+from hsnoise.statistics.decomposition import COMPONENTS, STATIC, Component, decomposed, mean_of
 
 DRAWS = 2  # of each model
 CLEAR = 2.0  # standard errors, below which a difference is chance
@@ -29,8 +30,9 @@ class Share(NamedTuple):
 
     Attributes:
         measured_dn2: its variance in the frames, DN^2; error_dn2: standard error of its difference from the model's.
-        closed_dn2, named_dn2: variance that the closed model and the named effects alone draw, DN^2.
-        of_total: its share of the variance of all components.
+        closed_dn2, named_dn2: variance that the whole model and its named effects alone draw, DN^2; the same unless it
+            is closed with measured components.
+        total_dn2: variance of all components in the frames, DN^2.
     """
 
     exposure_s: float
@@ -40,7 +42,12 @@ class Share(NamedTuple):
     error_dn2: float
     closed_dn2: float
     named_dn2: float
-    of_total: float
+    total_dn2: float
+
+    @property
+    def of_total(self) -> float:
+        """Its share of the variance of all components."""
+        return max(self.measured_dn2, 0.0) / self.total_dn2
 
     @property
     def named(self) -> float:
@@ -49,50 +56,82 @@ class Share(NamedTuple):
 
     @property
     def only_measured(self) -> float:
-        """Share that the closed model explains beyond them."""
+        """Share that measured components explain beyond them."""
         return max(self._part(self.closed_dn2) - self.named, 0.0)
 
     @property
     def unexplained(self) -> float:
-        """Distance of the closed model as a share of what was measured; 0 where it may be chance."""
-        off = abs(self.measured_dn2 - self.closed_dn2)
-        return off / self.measured_dn2 if off > CLEAR * self.error_dn2 and self.measured_dn2 > 0 else 0.0
+        """Distance of the model as a share of what was measured; 0 where it may be chance."""
+        return self.unexplained_dn**2 / self.measured_dn2 if self.measured_dn2 > 0 else 0.0
 
     @property
     def unexplained_of_total(self) -> float:
         """The same distance as a share of the variance of all components."""
-        return self.unexplained * self.of_total
+        return self.unexplained_dn**2 / self.total_dn2
+
+    @property
+    def unexplained_dn(self) -> float:
+        """The same distance as the rms, DN, that is missing or too much; 0 where it may be chance."""
+        off = abs(self.measured_dn2 - self.closed_dn2)
+        return float(np.sqrt(off)) if off > CLEAR * self.error_dn2 else 0.0
 
     def _part(self, drawn_dn2: float) -> float:
         return float(np.clip(drawn_dn2 / self.measured_dn2, 0, 1)) if self.measured_dn2 > 0 else 0.0
 
 
-def shares_of(named: NoiseModel, closed: NoiseModel, frames: FrameStack, key: RandomKey) -> tuple[Share, ...]:
-    """The shares of each component of the noise budget of dark `frames`, by draws of both models."""
-    measured = budget(frames)
-    models = {"named": named, "closed": closed}
-    drawn = {name: _drawn(model, frames, named_key(key, name)) for name, model in models.items()}
-    rows = []
-    for i, row in enumerate(measured.rows):
-        for component in COMPONENTS:
-            parts = {name: [found.rows[i].components[component] for found in of] for name, of in drawn.items()}
-            one = row.components[component]
-            error = np.hypot(_chance(component, one), _chance(component, parts["closed"][0]) / np.sqrt(DRAWS))
-            means = {name: float(np.mean([part.variance_dn2 for part in of])) for name, of in parts.items()}
-            share = max(one.variance_dn2, 0.0) / row.total_dn2
-            rows.append(
-                Share(
-                    row.exposure_s,
-                    row.channel,
-                    component,
-                    one.variance_dn2,
-                    error,
-                    means["closed"],
-                    means["named"],
-                    share,
-                )
-            )
-    return tuple(rows)
+def shares_of(
+    named: NoiseModel, frames: FrameStack, key: RandomKey, closed: NoiseModel | None = None
+) -> tuple[Share, ...]:
+    """The shares of each component of the noise of dark `frames`, two or more of each exposure, by draws of the model.
+
+    Raises ValueError for an exposure of one frame.
+    """
+    drawn = {"named": _drawn(named, frames, named_key(key, "named"))}
+    drawn["closed"] = drawn["named"] if closed is None else _drawn(closed, frames, named_key(key, "closed"))
+    found = []
+    for (i, channel), measured in _components(frames).items():
+        parts = {name: [one[i, channel] for one in of] for name, of in drawn.items()}
+        found += _shares(float(frames.exposure_s[i]), channel, measured, parts["named"], parts["closed"])
+    return tuple(found)
+
+
+Components = Mapping[str, Component]
+Place = tuple[int, str]  # number of the exposure, colour
+
+
+def _shares(
+    exposure_s: float, channel: str, measured: Components, named: list[Components], closed: list[Components]
+) -> Iterator[Share]:
+    total = sum(max(one.variance_dn2, 0.0) for one in measured.values())
+    for name, one in measured.items():
+        error = np.hypot(_chance(name, one), _chance(name, closed[0][name]) / np.sqrt(DRAWS))
+        whole, by_names = (_mean(name, of) for of in (closed, named))
+        yield Share(exposure_s, channel, name, one.variance_dn2, float(error), whole, by_names, max(total, 1e-300))
+
+
+def _components(frames: FrameStack) -> dict[Place, Components]:
+    tile = cfa_tile(frames.cfa)
+    step = len(tile)
+    found: dict[Place, Components] = {}
+    for i, exposure_s in enumerate(frames.exposure_s):
+        counts = np.stack(list(frames.frames(i)))
+        if len(counts) < 2:
+            raise ValueError(f"stack: expected two frames or more of each exposure, got one of {seconds(exposure_s)}")
+        for c, channel in enumerate(frames.channels):
+            planes = [counts[:, row::step, column::step] for row, column in np.argwhere(tile == c)]
+            of_planes = [decomposed(plane) for plane in planes]
+            found[i, channel] = {name: mean_of([one[name] for one in of_planes]) for name in COMPONENTS}
+    return found
+
+
+def largest_unexplained(shares: Sequence[Share]) -> Share | None:
+    """The component of which the largest part of the whole variance is unexplained, beyond chance; None without any.
+
+    Of so many components, one is off by chance in rules.FALSE_ALARM_RATE of captures.
+    """
+    limit = norm.isf(rules.FALSE_ALARM_RATE / (2 * max(len(shares), 1)))
+    off = [one for one in shares if one.unexplained_dn**2 > limit * one.error_dn2]
+    return max(off, key=lambda share: share.unexplained_of_total, default=None)
 
 
 def static_by_effect(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: Iterable[str]) -> dict[str, float]:
@@ -101,17 +140,21 @@ def static_by_effect(named: NoiseModel, frames: FrameStack, key: RandomKey, effe
     return {name: whole - _static(_drawn(named.remove(name), frames, key)) for name in effects if name in named}
 
 
-def _drawn(model: NoiseModel, like: FrameStack, key: RandomKey) -> list[NoiseBudget]:
-    return [budget(draw_capture(jax.random.fold_in(key, number), model, like)) for number in range(DRAWS)]
+def static_dn2(frames: FrameStack) -> float:
+    """Static variance of frames of one exposure, DN^2, mean over the colours."""
+    return _static([_components(frames)])
 
 
-def _static(found: list[NoiseBudget]) -> float:
-    return float(np.mean([static_dn2(one) for one in found]))
+def _drawn(model: NoiseModel, like: FrameStack, key: RandomKey) -> list[dict[Place, Components]]:
+    return [_components(draw_capture(jax.random.fold_in(key, number), model, like)) for number in range(DRAWS)]
 
 
-def static_dn2(found: NoiseBudget) -> float:
-    """Static variance of the budget of one exposure, DN^2, mean over the colours."""
-    return float(np.mean([sum(row.components[name].variance_dn2 for name in STATIC) for row in found.rows]))
+def _static(found: list[dict[Place, Components]]) -> float:
+    return float(np.mean([sum(of[name].variance_dn2 for name in STATIC) for one in found for of in one.values()]))
+
+
+def _mean(name: str, of: list[Components]) -> float:
+    return float(np.mean([one[name].variance_dn2 for one in of]))
 
 
 def _chance(name: str, of: Component) -> float:
@@ -138,12 +181,14 @@ def in_words(by_effect: dict[str, float], static_dn2: float) -> str:
 
 
 def as_table(shares: Iterable[Share]) -> Table:
-    """The shares as a table, in per cent."""
-    table = Table("exposure", "colour", "component", "DN²", "of all", "named", "only measured", "unexplained")
+    """The shares as a table, in per cent, and the rms that is missing or too much; only of what is there or drawn."""
+    table = Table("exposure", "colour", "component", "DN²", "of all", "named", "only measured", "unexplained", "DN rms")
     for one in shares:
-        if one.measured_dn2 > CLEAR * one.error_dn2:
-            percent = (f"{100 * x:.1f} %" for x in (one.of_total, one.named, one.only_measured, one.unexplained))
-            table.add_row(seconds(one.exposure_s), one.channel, one.component, f"{one.measured_dn2:.4g}", *percent)
+        if max(one.measured_dn2, one.closed_dn2) > CLEAR * one.error_dn2:
+            percent = [f"{100 * x:.1f} %" for x in (one.of_total, one.named, one.only_measured, one.unexplained)]
+            off = f"{one.unexplained_dn:.2g}" if one.unexplained_dn > 0 else ""
+            variance = f"{max(one.measured_dn2, 0.0):.4g}"
+            table.add_row(seconds(one.exposure_s), one.channel, one.component, variance, *percent, off)
     return table
 
 

@@ -102,7 +102,7 @@ class Story:
         if last.light == Light.RED or error >= rules.CLOSE:
             light = Light.RED
         else:
-            light = last.light if self.finished and error < rules.FITS else Light.AMBER
+            light = last.light if self.finished and self.steps[-1].comparison.fits else Light.AMBER
         doubt = "" if last.light == Light.GREEN else last.sentence
         found = self.steps[-1].diagnosis
         ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
@@ -213,10 +213,10 @@ class Story:
 
 def _light_of_closed(closed: ClosedModel, of_fit: Light) -> Light:
     """A closed model may be used if either error is small; its electrons are no surer than the gain of the fit."""
-    error, left = closed.comparison.error, closed.largest_unexplained.unexplained_of_total
-    if error >= rules.CLOSE and left > rules.CLOSED_SHARE:
+    error, worst = closed.comparison.error, closed.largest_unexplained
+    if error >= rules.CLOSE and worst is not None and worst.unexplained_of_total > rules.CLOSED_SHARE:
         return Light.RED
-    return Light.GREEN if error < rules.FITS and of_fit == Light.GREEN else Light.AMBER
+    return Light.GREEN if closed.comparison.fits and of_fit == Light.GREEN else Light.AMBER
 
 
 def together(before: Step, after: Step) -> str:

@@ -31,7 +31,6 @@ LEAST_RANGE = 0.5  # share of the signal range that levels must span after the h
 FEWEST_LEVELS = 4  # likewise
 LINE_RANGE = 0.7  # of saturation: EMVA 1288, release 4, section 6.6
 NARROW_DN2 = 0.25  # variance, rounding included, below which rounding depends on where the mean lies between counts
-LOW = 0.25  # of the highest signal: a level below it shows where the curve begins
 PAST_PEAK, STEEP = 0.05, 0.1  # saturation: the variance falls by more than this, from its peak or anywhere
 LEAST_SIGMAS = 3.0  # by which a level's variance must exceed that of the darks
 

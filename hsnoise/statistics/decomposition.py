@@ -14,7 +14,7 @@ noise", SPIE 1488, 1991; expected mean squares: Searle, Casella, McCulloch, *Var
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -95,6 +95,34 @@ class PlaneSums:
         if n < 2 or min(h, w) < 2:
             return dict.fromkeys(COMPONENTS, Component(np.nan, np.nan))
         return _from_mean_squares(_sums_of_squares(self), n, h, w)
+
+
+def decomposed(counts: np.ndarray) -> dict[str, Component]:
+    """The components of one colour plane in memory, whole counts [frame, row, column] of two frames or more."""
+    sums = PlaneSums(counts.shape[1:])
+    for plane in counts:
+        sums.add(plane)
+    variance = counts.var(axis=0, ddof=1, dtype=np.float64)
+    return with_tails(sums.components(), sums.mean_map_dn().astype(np.float64), variance, sums.shape)
+
+
+def with_tails(
+    found: dict[str, Component], level_dn: np.ndarray, variance_dn2: np.ndarray, shape: tuple[int, int]
+) -> dict[str, Component]:
+    """Components with shares, and errors taken from the pixels themselves, whose noise differs and has tails.
+
+    Of all rows or some: level_dn [row, column] is the mean of each pixel, variance_dn2 its temporal variance; shape:
+    of the whole plane.
+    """
+    level = level_dn - level_dn.mean(0) - level_dn.mean(1, keepdims=True) + level_dn.mean()
+    for name, values in {"temporal": variance_dn2, "pixel": level**2}.items():
+        error = float(values.std(dtype=np.float64)) / np.sqrt(shape[0] * shape[1])
+        found[name] = replace(found[name], standard_error_dn2=max(error, found[name].standard_error_dn2))
+    total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
+    return {
+        name: replace(c, share=max(c.variance_dn2, 0.0) / total if total > 0 else float("nan"))
+        for name, c in found.items()
+    }
 
 
 def of_neighbouring_rows(row_mean_dn: np.ndarray) -> Component:

@@ -126,11 +126,13 @@ def test_flats_of_several_levels_show_the_response(loss, is_bent):
 
 
 def test_shares_add_up():
-    one = Share(1.0, "mono", "pixel", 10.0, 0.1, 9.5, 6.0, 0.5)
+    one = Share(1.0, "mono", "pixel", 10.0, 0.1, 9.5, 6.0, 20.0)
     assert (one.named, one.only_measured) == pytest.approx((0.6, 0.35)) and one.unexplained == pytest.approx(0.05)
     assert one.unexplained_of_total == pytest.approx(0.025)
     assert one._replace(error_dn2=1.0).unexplained == 0
     assert one._replace(named_dn2=30.0).only_measured == 0
+    absent = one._replace(measured_dn2=0.0, closed_dn2=4.0)  # drawn, but not there
+    assert (absent.of_total, absent.unexplained_of_total, absent.unexplained_dn) == pytest.approx((0, 0.2, 2.0))
 
 
 def test_the_sentence_names_what_holds_most():

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
-from hsnoise.statistics.decomposition import COMPONENTS, Component, PlaneSums, of_neighbouring_rows
+from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouring_rows, with_tails
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
@@ -186,12 +186,19 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         row_mean_dn=row_frame.mean(0) + reference,
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
-        components=_with_tails(sums.components(), halves, sums.shape),
+        components=_components(sums, halves),
         rows_together=of_neighbouring_rows(row_frame),
         halves=halves,
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )
+
+
+def _components(sums: PlaneSums, halves: Halves | None) -> dict[str, Component]:
+    if halves is None:
+        return sums.components()
+    level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, sums.shape[1])
+    return with_tails(sums.components(), level, halves.pair_variance_dn2, sums.shape)
 
 
 def _neighbours_share(counts: np.ndarray) -> float:
@@ -212,20 +219,3 @@ def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | 
     if halves is None or not 0 < float(halves.pair_variance_dn2.mean()) < NARROW_DN2:
         return None
     return narrow_read_noise(counts)
-
-
-def _with_tails(found: dict[str, Component], halves: Halves | None, shape: tuple[int, int]) -> dict[str, Component]:
-    """Components with errors taken from the pixels themselves, whose noise differs and has tails."""
-    if halves is None:
-        return found
-    level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, shape[1])
-    level = level - level.mean(0) - level.mean(1, keepdims=True) + level.mean()
-    scatter = {"temporal": halves.pair_variance_dn2, "pixel": level**2}
-    for name, values in scatter.items():
-        error = float(values.std(dtype=np.float64)) / np.sqrt(shape[0] * shape[1])
-        found[name] = replace(found[name], standard_error_dn2=max(error, found[name].standard_error_dn2))
-    total = sum(max(found[name].variance_dn2, 0.0) for name in COMPONENTS)
-    return {
-        name: replace(c, share=max(c.variance_dn2, 0.0) / total if total > 0 else float("nan"))
-        for name, c in found.items()
-    }

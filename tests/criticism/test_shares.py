@@ -1,0 +1,78 @@
+"""What `compare` says of the noise budget, and of a single statistic that is off."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise import effects as fx
+from hsnoise._core.conclusion import Light
+from hsnoise.criticism import rules
+from hsnoise.criticism.compare import Comparison
+from hsnoise.criticism.shares import Share, largest_unexplained, shares_of
+from hsnoise.statistics.decomposition import COMPONENTS
+
+EXPOSURES_S = (0.02, 0.2)
+CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
+
+
+def capture(model: hsnoise.NoiseModel, exposures_s=EXPOSURES_S, frames: int = 6) -> hsnoise.FrameStack:
+    key = jax.random.key(7)
+    counts = [
+        np.asarray(hsnoise.sample_dark(jax.random.fold_in(key, i), frames, (64, 96), model, exposure_s=t, sensor_key=3))
+        for i, t in enumerate(exposures_s)
+    ]
+    return hsnoise.FrameStack(counts, exposures_s, black_level=64, white_level=65535, cfa="RGGB", shutter="global")
+
+
+def test_the_true_model_leaves_no_component_unexplained():
+    found = hsnoise.compare(CAMERA, capture(CAMERA), draws=16)
+    assert found.largest_unexplained is None and "beyond chance" in found.unexplained and found.fits
+    assert len(found.shares) == len(EXPOSURES_S) * 3 * len(COMPONENTS)
+    of_all = [one.of_total for one in found.shares if one.exposure_s == 0.2 and one.channel == "G"]
+    assert sum(of_all) == pytest.approx(1)
+    assert 0 < found.max_z < rules.MAX_Z and 1 / 17 <= found.max_z_p_value <= 1
+
+
+@pytest.mark.parametrize(
+    ("effect", "component", "size_e"),
+    [(fx.FrameOffset(2.0), "frame", 2.0), (fx.DarkSignalNonuniformity(3.0), "pixel", 3.0)],
+)
+def test_a_missing_effect_shows_in_its_component_at_its_size(effect, component, size_e):
+    gain = CAMERA.table["gain.G"][0]
+    found = hsnoise.compare(CAMERA, capture(CAMERA.add(effect), frames=24), draws=16)
+    worst = found.largest_unexplained
+    assert worst.component == component and worst.closed_dn2 < worst.measured_dn2
+    green = [one for one in found.shares if one.component == component and one.channel == "G"]
+    assert np.mean([one.unexplained_dn for one in green]) == pytest.approx(size_e * gain, rel=0.35)
+    assert f"{component} at" in found.unexplained and "too little" in found.unexplained
+
+
+def test_noise_that_is_not_there_is_too_much():
+    found = hsnoise.compare(CAMERA.add(fx.FrameOffset(4.0)), capture(CAMERA, frames=24), draws=16)
+    assert found.largest_unexplained.component == "frame" and "too much" in found.unexplained
+
+
+def test_single_frames_have_no_shares():
+    frames = [np.asarray(hsnoise.sample_dark(i, 1, (64, 96), CAMERA, exposure_s=t)) for i, t in enumerate(EXPOSURES_S)]
+    stack = hsnoise.FrameStack(frames, EXPOSURES_S, black_level=64, cfa="RGGB", shutter="global")
+    found = hsnoise.compare(CAMERA, stack, draws=8)
+    assert found.shares == () and found.unexplained == "" and found.largest_unexplained is None
+    with pytest.raises(ValueError, match="stack: expected two frames or more of each exposure, got one of 20 ms"):
+        shares_of(CAMERA, stack, jax.random.key(0))
+
+
+def test_of_many_components_one_is_off_by_chance():
+    just = Share(1.0, "mono", "pixel", 10.0, 1.0, 13.0, 13.0, 20.0)  # three standard errors
+    assert largest_unexplained([just]) is just
+    assert largest_unexplained([just] * 100) is None
+    assert largest_unexplained([]) is None
+
+
+def test_one_statistic_far_off_does_not_fit_however_small_the_error():
+    row = ("static rows: strongest frequency", "static rows", 3.0, 1.0, 9.0)
+    found = Comparison(1.4, {"static rows": 1.4}, (row,), ("strongest frequency: measured 3",), 0.5, -1.0, ())
+    assert not found.fits and found.max_z == 9.0 and found.conclusion.light == Light.AMBER
+    assert "fits but for one statistic, 9 deviations off" in found.conclusion.sentence
