@@ -89,7 +89,8 @@ class Comparison:
         light = Light.AMBER if is_close else Light.RED
         if self.error < rules.FITS:
             return Conclusion(light, sentences.fails_in_one(self.error, self.max_z, self.worst[0]))
-        return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close))
+        right = sentences.right_in_variance(self.largest_unexplained) if self.shares else ""
+        return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close), right)
 
     @property
     def own_misfit(self) -> float:

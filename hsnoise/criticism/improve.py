@@ -15,7 +15,7 @@ from hsnoise.criticism import rules, sentences
 from hsnoise.criticism.acceptance import is_there, is_too_little, why_worse
 from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
 from hsnoise.criticism.closing import closed, repeated_darks
-from hsnoise.criticism.compare import DRAWS, Comparison, compared
+from hsnoise.criticism.compare import DRAWS, Comparison, compared, with_shares
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.finding import Diagnosis
 from hsnoise.criticism.held_out import log_likelihood, split_frames, split_in_words
@@ -135,6 +135,8 @@ def improved(
             continue
         if ending is not None:
             break
+    last = steps[-1]
+    steps[-1] = replace(last, comparison=with_shares(last.comparison, last.fit.params, portion, seed))
     story = Story(tuple(steps), ending, split)
     log.info("Improved: %s", story.ended)
     if close:

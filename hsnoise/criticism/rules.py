@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 # One definition of a model that fits: an error below FITS, as 98 to 99 % of right models have (benchmarks.rules), and
-# no single statistic MAX_Z deviations off, which the mean of a large group would hide. Of 600 right models, one had 5.4.
+# no single statistic MAX_Z deviations off, which a large group would hide: of 600 right models one had 5.4.
 FITS, MAX_Z = 2.0, 7.0
 CLOSED_SHARE = 0.01  # of the variance, unexplained in a component of a closed model: half a percent of the rms
 CLOSE = 10.0  # an error below this: of use, with doubts; noise of the wrong kind is off by no more than its own size

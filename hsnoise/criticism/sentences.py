@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsnoise._core.types import seconds, unit_in_words
+from hsnoise.criticism import rules
 from hsnoise.criticism.outcomes import Ended, Ending, Refusal, Refused, Verdict, has_sides, side_of
 from hsnoise.effects import AbstractEffect
 from hsnoise.fitting.result import number, rounded
@@ -70,6 +71,16 @@ def unexplained(worst: Share | None) -> str:
         f"the noise budget differs most in {worst.component} at {seconds(worst.exposure_s)}: the model draws"
         f" {worst.unexplained_dn:.2g} DN rms {much}, {100 * worst.unexplained_of_total:.2g} % of the variance of all"
     )
+
+
+def right_in_variance(worst: Share | None) -> str:
+    """What a model that does not fit has right: the variance of each component; empty if it has not."""
+    if worst is None:
+        return "The variance of each component of the noise is right within chance; their structure differs."
+    share = worst.unexplained_of_total
+    if share > rules.CLOSED_SHARE:
+        return ""
+    return f"The variance of each component of the noise is right within {100 * share:.1g} % of the whole."
 
 
 def measure(error: float, misfit: float, own: float) -> str:

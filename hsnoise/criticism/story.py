@@ -151,10 +151,11 @@ class Story:
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """What measured components add, or why they were left out, in sentences; none if they were not asked for."""
+        """The part of the noise that is not reproduced; with measured components, or why they were left out."""
         if self.closed is not None:
             return self.closed.summary, self.closed.static
-        return (self.left_open,) if self.left_open else ()
+        left = self.steps[-1].comparison.unexplained
+        return tuple(f"{one[0].upper()}{one[1:]}" for one in (left and f"{left}.", self.left_open) if one)
 
     @property
     def care(self) -> str:

@@ -27,7 +27,8 @@ from hsnoise.simulation.gaussian import FAR_OFF, share_of_far, shrunk_covariance
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 
-MEAN_DRAWS, SLOPE_DRAWS, LAST_DRAWS = 8, 2, 32
+MEAN_DRAWS, SLOPE_DRAWS = 8, 2
+LAST_DRAWS, LAST_SLOPES = 32, 6  # at the end; noise in the slopes of few draws passes for information
 SCATTER_DRAWS, SCATTER_FROM = 32, 1000  # draws for the weights; numbered apart from those for the means
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
 SLOPE_NOISE = 8.0  # a slope of fewer standard errors than the root of this counts as zero
@@ -109,10 +110,10 @@ class _Yardstick:
             found.append(np.diagonal(as_scattered(covariance, gain, prior, others - others.mean(0))))
         return np.sqrt(np.mean(found, 0))
 
-    def slopes(self, y: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Derivatives of the statistics at y [statistic, number], over `steps`."""
+    def slopes(self, y: np.ndarray, steps: np.ndarray, count: int = SLOPE_DRAWS) -> np.ndarray:
+        """Derivatives of the statistics at y [statistic, number], over `steps`, from `count` draws."""
         moved = [self.problem.at(y + steps * (np.arange(len(y)) == i)) for i in range(len(y))]
-        slopes = self.simulator.slopes(self.problem.at(y), moved, steps, SLOPE_DRAWS)
+        slopes = self.simulator.slopes(self.problem.at(y), moved, steps, count)
         return _without_noise(slopes / self.deviation).T
 
 
@@ -172,12 +173,24 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    # The search knows means only to a third of their scatter, and the scatter only where it began.
-    last = simulator.reference(problem.at(here.y), LAST_DRAWS)
-    here = yard.point(here.y, LAST_DRAWS)
+    return *_last_step(problem, yard, here.y, weight, by), length, iterations
+
+
+def _last_step(
+    problem: Problem, yard: _Yardstick, y: np.ndarray, weight: np.ndarray, by: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """y after a step from where the search ended, and its covariance.
+
+    The search knows means only to a third of their scatter, slopes only from two draws, and the scatter only where it
+    began.
+    """
+    last = yard.simulator.reference(problem.at(y), LAST_DRAWS)
+    here, slopes = yard.point(y, LAST_DRAWS), yard.slopes(y, by, LAST_SLOPES)
+    gain = slopes.T @ weight
+    covariance = np.linalg.inv(gain @ slopes + np.diag(problem.prior))
     step = covariance @ here.uphill(gain, problem)
     scattered = as_scattered(covariance, gain, problem.prior, (last.draws - last.mean) / yard.deviation)
-    return here.y + step * problem.share_of(step), scattered, length, iterations
+    return here.y + step * problem.share_of(step), scattered
 
 
 def _updated(slopes: np.ndarray, here: _Point, there: _Point) -> np.ndarray:

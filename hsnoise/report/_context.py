@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.conclusion import Conclusion, Light
-from hsnoise._core.types import unit_in_words
+from hsnoise._core.types import seconds, unit_in_words
 from hsnoise.criticism import Comparison, Diagnosis, Step, Story
 from hsnoise.criticism.compare import nearer
 from hsnoise.criticism.outcomes import Ended, Verdict
@@ -24,7 +24,7 @@ from hsnoise.statistics.structure import explained
 ALARM = 2.0  # times the worst group of the model's own samples
 LEAST_SHOWN = 0.1  # misfit at the left end of the bars
 YARDSTICK = "1.0 would be as close as the model's own samples"
-MOST_CANDIDATES, MOST_FILES = 10, 3
+MOST_CANDIDATES, MOST_FILES, MOST_SHARES = 10, 3, 8
 TITLES = {
     Comparison: "Model against measurement",
     Diagnosis: "What is missing",
@@ -64,6 +64,7 @@ def context(
         "outcome": fit.outcome if isinstance(fit, FitResult) else "",
         "bars": None if comparison is None else bars(comparison),
         "comparison": comparison,
+        "shares": () if comparison is None else left_by(comparison, story),
         "words": () if comparison is None else explained(comparison.worst),
         "diagnosis": diagnosis,
         "ranking": [] if diagnosis is None else ranking(diagnosis),
@@ -168,6 +169,23 @@ def bars(comparison: Comparison) -> dict[str, Any]:
     ]
     ends = LEAST_SHOWN, largest
     return {"groups": shown, "one": _along(1.0, *ends), "own": _along(own, *ends), "own_misfit": number(own)}
+
+
+def left_by(comparison: Comparison, story: Story | None) -> list[dict[str, str]]:
+    """The components of the noise budget that the model is furthest from, that of most of the variance first."""
+    shares = comparison.shares if story is None or story.closed is None else story.closed.shares
+    off = sorted((one for one in shares if one.unexplained_dn > 0), key=lambda one: -one.unexplained_of_total)
+    return [
+        {
+            "component": one.component,
+            "where": " ".join(("" if one.channel == "mono" else one.channel, seconds(one.exposure_s))).strip(),
+            "measured": f"{max(one.measured_dn2, 0.0):.3g}",
+            "model": f"{max(one.closed_dn2, 0.0):.3g}",
+            "off": f"{one.unexplained_dn:.2g}",
+            "share": f"{100 * one.unexplained_of_total:.2g} %",
+        }
+        for one in off[:MOST_SHARES]
+    ]
 
 
 def _along(value: float, low: float, high: float) -> str:
