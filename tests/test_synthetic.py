@@ -156,6 +156,32 @@ def test_a_step_that_leads_away_is_taken_back():
     assert np.all(np.sqrt(np.diagonal(covariance)) < 0.05)
 
 
+class Plain(Bent):
+    """A problem of two numbers and 120 statistics, of which twenty depend on them."""
+
+    start, truth = np.array([0.5, -0.5]), np.zeros(2)
+
+
+class Rough(Simulator):
+    """Draws of it, whose noise changes with the numbers: slopes between two draws are noisy."""
+
+    def _draw(self, y, number):
+        one, other = np.random.default_rng(number).standard_normal((2, 120))
+        angle = 3 * np.sum(y)
+        values = np.repeat([3 * y[0], 3 * y[1], 0.0], [10, 10, 100]) + np.cos(angle) * one + np.sin(angle) * other
+        return Structure(("",) * 120, ("",) * 120, values, np.full(120, 0.3), ())
+
+    @property
+    def measured(self):
+        return self._draw(Plain.truth, self.key)
+
+
+def test_noise_of_slopes_is_not_taken_for_information():
+    found = [_search(Plain(), Rough(None, None, 10_000 + number)) for number in range(100)]
+    pulls = np.array([(y - Plain.truth) / np.sqrt(np.diagonal(covariance)) for y, covariance, *_ in found])
+    assert 0.9 < np.sqrt(np.mean(pulls**2)) < 1.2  # 200 pulls: 1 +- 0.05, and their errors are from 32 draws
+
+
 def test_what_a_line_fit_does_not_know_stays_unknown():
     covariance = not_surer_than(np.diag([4.0, np.inf]), np.eye(3))
     np.testing.assert_allclose(np.diagonal(covariance), [4.0, np.inf, 4.0])
