@@ -1,8 +1,8 @@
 """What `improve` makes of real sensors in a few minutes each: python -m benchmarks.real_loop
 
-Their dark frames alone, as `benchmarks.closed` takes them: what was added and the error after each addition, the largest
-part of the variance that is left, and the change of the likelihood of held-out frames. Finished sensors are lines of
-`--out`, and are not run again. Needs the captures of shared/.
+Their dark frames alone, as `benchmarks.closed` takes them: what was added and the error after each addition, the
+largest part of the variance that is left, and the change of the likelihood of held-out frames. Finished sensors are
+lines of `--out`, and are not run again. Needs the captures of shared/.
 
     python -m benchmarks.real_loop --minutes 5 --only STL IMX
 """
