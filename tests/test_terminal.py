@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from dataclasses import replace
@@ -24,6 +25,7 @@ from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
 
 NOTES = tuple(f"note {i} says what the frames do not determine, at such length that it fills a line" for i in range(60))
+COMMAND_LINE = Path(__file__).parents[1] / "docs" / "command-line.md"
 DOUBTS = ("the first doubt is in the sentence", "another doubt is above the table")
 
 
@@ -64,9 +66,10 @@ def printed(found, capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(_results, "improved", lambda *_, **__: found["improve"])
 
     def run(command: str, *options: str) -> str:
+        judged = command in ("fit", "improve") and found[command].conclusion.light == Light.RED
         more = [] if command == "inspect" else ["--out", str(tmp_path / command)]
         more += ["--model", "canon_5d3"] if command == "compare" else []
-        assert main([command, str(capture), *more, *options, "--debug"]) == 0
+        assert main([command, str(capture), *more, *options, "--debug"]) == int(judged)
         return capsys.readouterr().out
 
     return run
@@ -191,3 +194,51 @@ def test_sample_says_what_it_wrote_and_python_that_reads_it(suffix, frames, clea
     stack = read["stack"]
     assert (stack.kind, stack.n_frames, stack.shape, stack.cfa) == ((kind,), (frames,), (16, 24), "RGGB")
     assert (stack.shutter, float(np.max(stack.black_level)), stack.exposure_s[0]) == ("global", 0.0, 0.125)
+
+
+def names_in_docs(command: str) -> set[str]:
+    """The names that docs/command-line.md gives to what --json prints for a command."""
+    rows = [line.split("|") for line in COMMAND_LINE.read_text().splitlines() if line.startswith("| ")]
+    return {name for row in rows if row[1].strip() in ("all", command) for name in re.findall(r"`(\w+)`", row[2])}
+
+
+@pytest.mark.parametrize("command", HEADINGS)
+def test_json_is_alone_on_standard_output_and_as_documented(command, printed, found):
+    said = printed(command, "--json")
+    content = json.loads(said, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert said.count("\n") == 1 and set(content) == names_in_docs(command)
+    assert content["command"] == command and content["light"] in set(Light)
+    assert all(Path(one).is_file() for one in content["files"]) and bool(content["files"]) is (command != "inspect")
+    if command in found:
+        assert content["conclusion"] == found[command].conclusion.sentence
+
+
+def test_json_says_what_is_held_and_what_is_not_known(printed, found):
+    parameters = json.loads(printed("fit", "--json"))["parameters"]
+    for name, (value, error, unit) in found["fit"].table.items():
+        one = parameters[name]
+        assert one["unit"] == unit and (one["value"] == value if np.isfinite(value) else one["value"] is None)
+        known = "held" if error == 0 else "fitted"
+        assert one["state"] == (known if np.isfinite(value) and np.isfinite(error) else "not determined")
+    assert {one["state"] for one in parameters.values()} > {"fitted"}
+    assert json.loads(printed("improve", "--json"))["steps"][1]["added"] == "row_noise"
+
+
+@pytest.mark.parametrize("grave", [False, True])
+def test_results_that_should_not_be_used_have_an_exit_status_of_their_own(grave, printed, found, monkeypatch):
+    story, fit = found["improve"], replace(found["fit"], grave=grave)
+    judged = {
+        "fit": fit,
+        "improve": replace(
+            story, steps=(*story.steps[:-1], replace(story.steps[-1], fit=replace(story.fit, grave=grave)))
+        ),
+    }
+    for command in judged:
+        monkeypatch.setitem(found, command, judged[command])
+        assert json.loads(printed(command, "--json"))["light"] == ("red" if grave else "amber")
+
+
+def test_bad_input_says_nothing_on_standard_output(tmp_path, capsys):
+    assert main(["fit", str(tmp_path / "none.npz"), "--json"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "none.npz" in said.err

@@ -6,6 +6,8 @@ import argparse
 import os
 import sys
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,6 +15,7 @@ from rich.console import Console
 import hsnoise
 from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
+from hsnoise._core.conclusion import Light
 from hsnoise._core.events import Event, counter
 from hsnoise._core.naming import as_options
 from hsnoise._core.output import write_figure
@@ -20,6 +23,7 @@ from hsnoise.cli import demo as _demo
 from hsnoise.cli import enhance as _enhance
 from hsnoise.cli import options as _options
 from hsnoise.cli import sample as _sample
+from hsnoise.cli.as_json import as_json
 from hsnoise.cli.loading import load_capture, model_of, same_capture
 from hsnoise.cli.progress import busy, fit_with_progress
 from hsnoise.cli.results import check_folder, improve_with_progress, keep, write_results
@@ -67,9 +71,9 @@ BROKEN_PIPE = 128 + 13  # a shell's exit code for a process ended by SIGPIPE
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command. Exit codes: 0; 1 if a fit of the capture makes no sense; 2 after an error, printed in a sentence.
+    """Run a command. Exit codes: 0; 1 if the result should not be used; 2 after an error, printed in a sentence.
 
-    141 if the reader of the output is gone; 130 after Ctrl-C.
+    141 if the reader of the output is gone; 130 after Ctrl-C. docs/command-line.md says more.
     """
     _interrupting.on_disk("")
     try:
@@ -123,22 +127,26 @@ def _inspect(args: argparse.Namespace) -> int:
     stack = load_capture(args.paths, args)
     with busy("Looking at the frames", of="frame") as say:
         found = hsnoise.inspect(stack, progress=counter(say, Event("Looking at the frames")))
-    tell(page_of_inspection(found), verbose=args.verbose)
-    return 0 if found.fit_makes_sense else 1
+    _tell(args, page_of_inspection(found), found)
+    return _status(found)
 
 
-def _fit(args: argparse.Namespace) -> None:
+def _fit(args: argparse.Namespace) -> int:
     check_folder(args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
     args.out.mkdir(parents=True, exist_ok=True)  # fail before the long work
     fit = fit_with_progress(stack, args.method, model, args.pixels)
     written = write_results(fit, args.out, {"files": args.paths})
+    files = [args.out / name for name in written]
     if args.maps is not None:
         fit.pixels.save(args.maps)
         written.append(str(args.maps))
+        files.append(args.maps)
     command = f"hsnoise compare {same_capture(args)} --model {args.out / 'model.json'}"
     page = page_of_fit(fit, rest=(str(stack), MEANING))
-    tell(page, [f"Written to {args.out}/: {', '.join(written)}", LOOK[fit.method].format(command)], args.verbose)
+    foot = (f"Written to {args.out}/: {', '.join(written)}", LOOK[fit.method].format(command))
+    _tell(args, page, fit, foot, files)
+    return _status(fit)
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -165,7 +173,7 @@ def _diagnose(args: argparse.Namespace) -> None:
     _show(args, found, page_of_diagnosis(found), "ranking.png", stack, **more)
 
 
-def _improve(args: argparse.Namespace) -> None:
+def _improve(args: argparse.Namespace) -> int:
     _check_outputs(args)
     stack = _load(args)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -173,7 +181,8 @@ def _improve(args: argparse.Namespace) -> None:
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
-    _show(args, story, page_of_story(story), "story.png", stack, (f"Written to {args.out}/: {', '.join(written)}",))
+    _show(args, story, page_of_story(story), "story.png", stack, written)
+    return _status(story)
 
 
 # Work
@@ -198,13 +207,33 @@ def _compared(model, stack: FrameStack, seed: int) -> Comparison:
 
 
 def _show(
-    args: argparse.Namespace, found, page: Page, figure: str, stack: FrameStack, foot: tuple[str, ...] = (), **more: Any
+    args: argparse.Namespace,
+    found,
+    page: Page,
+    figure: str,
+    stack: FrameStack,
+    written: Sequence[str] = (),
+    **more: Any,
 ) -> None:
     """Draw the figure of a result, write its report, and print its page."""
     write_figure(args.out / figure, found.plot())
     _write_report(args, found, stack, **more)
-    reported = [] if args.report is None else [f"Report: {args.report}"]
-    tell(page, [*foot, f"Figure: {args.out / figure}", *reported], args.verbose)
+    foot = [f"Written to {args.out}/: {', '.join(written)}"] if written else []
+    reported = [] if args.report is None else [args.report]
+    foot += [f"Figure: {args.out / figure}", *(f"Report: {one}" for one in reported)]
+    _tell(args, page, found, foot, [*(args.out / name for name in (*written, figure)), *reported])
+
+
+def _tell(args: argparse.Namespace, page: Page, found, foot: Sequence[str] = (), files: Sequence[Path] = ()) -> None:
+    """Print the page of a result; with --json the result itself, and the page to standard error."""
+    tell(page, foot, args.verbose, sys.stderr if args.json else sys.stdout)
+    if args.json:
+        print(as_json(found, args.command, map(str, files)), flush=True)
+
+
+def _status(found) -> int:
+    """The exit code: 1 for a result that should not be used."""
+    return 1 if found.conclusion.light == Light.RED else 0
 
 
 def _write_report(args: argparse.Namespace, found, stack: FrameStack, **keywords: Any) -> None:

@@ -35,6 +35,9 @@ def parser() -> Parser:
     training_arguments(commands)
     for name in ("demo", "inspect", "fit", "compare", "diagnose", "improve"):
         commands.choices[name].add_argument("--verbose", action="store_true", help="print all results")
+    for name in ("inspect", "fit", "compare", "diagnose", "improve"):
+        text = "print the result as one line of JSON, and what is for reading to standard error"
+        commands.choices[name].add_argument("--json", action="store_true", help=text)
     for command in commands.choices.values():
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return top
@@ -76,7 +79,8 @@ def _inspect_arguments(commands: Any) -> None:
 def _fit_arguments(commands: Any) -> None:
     text = (
         "Fit the noise model to dark frames. Reads raw, DNG, FITS, TIFF, PNG, NumPy and HDF5 files, all at one ISO, "
-        "best at several exposures. Writes model.json, table.csv and figures to a folder."
+        "best at several exposures. Writes model.json, table.csv and figures to a folder. Exits with 1 if the numbers "
+        "should not be used."
     )
     fit = commands.add_parser("fit", help="measure the noise of a camera from dark frames", description=text)
     fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
@@ -117,7 +121,8 @@ def _loop_arguments(commands: Any) -> None:
         "improve",
         help="fit, find what is missing, add it, until nothing is left",
         description="The whole loop: fit the frames, find the effect that the model lacks, add it and fit again, until "
-        "nothing significant is left: 5 to 20 minutes. Writes model.json, table.csv, story.txt and a figure.",
+        "nothing significant is left: 5 to 20 minutes. Writes model.json, table.csv, story.txt and a figure. Exits "
+        "with 1 if the model should not be used.",
     )
     for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):
         if name == "diagnose":

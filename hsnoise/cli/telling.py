@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TextIO
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -45,9 +46,12 @@ class Page:
     colour: str = "yellow"
 
 
-def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
-    """Print a page: what fits on one screen, the number of lines left out, and the whole `foot`; or everything."""
-    console = screen()
+def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False, to: TextIO | None = None) -> None:
+    """Print a page: what fits on one screen, the number of lines left out, and the whole `foot`; or everything.
+
+    to: where; None: standard output.
+    """
+    console = screen(to)
     doubts = [Text(f"! {one}", page.colour) for one in page.doubts]
     head = [_printed(one, console) for one in (_light(page.conclusion, console), *doubts)]
     tables = [one for table in page.tables for one in _rows(table, console)]
@@ -60,13 +64,13 @@ def tell(page: Page, foot: Iterable[str] = (), verbose: bool = False) -> None:
     left_out = _count(everything) - _count(shown)
     more = [f"{left_out} more line{'s' if left_out > 1 else ''}: --verbose"] if left_out else []
     # In one piece: a reader that is gone is no reason to break off in the middle.
-    print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), flush=True)
+    print("\n".join([*(text for text, _ in shown), *more, *(text for text, _ in last)]), file=to, flush=True)
 
 
-def screen() -> Console:
+def screen(to: TextIO | None = None) -> Console:
     """The terminal, or a file in which sentences are not wrapped."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=COLUMNS, height=LINES + 1)
+    console = Console(highlight=False, file=to)
+    return console if console.is_terminal else Console(highlight=False, file=to, width=COLUMNS, height=LINES + 1)
 
 
 def page_of_fit(fit: FitResult, rest: tuple[str, ...] = (), truth: NoiseModel | None = None) -> Page:
