@@ -136,7 +136,9 @@ class Reader:
         status = main([*words, *IN_LITTLE.get(words[0], [])])
         out, err = self.capsys.readouterr()
         # With so few steps the model may be one that should not be used.
-        assert status == 0 or (status == 1 and words[0] in ("fit", "improve")), f"{line}: exit status {status}\n{out}\n{err}"
+        assert status == 0 or (status == 1 and words[0] in ("fit", "improve")), (
+            f"{line}: exit status {status}\n{out}\n{err}"
+        )
         return out
 
     def compare(self, block: str, said: str) -> None:

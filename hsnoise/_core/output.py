@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import uuid
@@ -26,13 +27,20 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
         OSError: the folder does not exist or cannot be written; an existing file is left as it was.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "expected a file, but it is a folder", str(path))
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     with unfinished(temporary):
-        with open(temporary, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)  # atomic within a directory
+        try:
+            with open(temporary, "xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)  # atomic within a directory
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise type(error)(error.errno, error.strerror, str(path)) from error  # not of the temporary file
 
 
 def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:
@@ -94,6 +102,13 @@ def _write_tiff(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, A
             file.write(frame, photometric="minisblack", metadata=None, extratags=[tag])
 
 
+def _array(path: Path) -> Any:
+    try:
+        return np.load(path)
+    except ValueError as error:  # pickled objects, which are not loaded, or a broken file
+        raise ValueError(f"{path}: cannot be read as an array of numbers: {error}") from error
+
+
 def read_image(path: str | os.PathLike) -> np.ndarray:
     """An image of light, `[row, column]` or `[row, column, 3]` in R, G, B, from .npy, .tif or .png.
 
@@ -104,7 +119,9 @@ def read_image(path: str | os.PathLike) -> np.ndarray:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        image = np.load(path)
+        image = _array(path)
+        if not isinstance(image, np.ndarray):
+            raise ValueError(f"{path}: expected one array, got an archive of several (.npz)")
     elif suffix in (".tif", ".tiff"):
         import tifffile
 

@@ -43,7 +43,9 @@ def read_model(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, np.nd
     another model.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_once_each)
+    except RecursionError:
+        raise ValueError(f"{path}: not a noise model saved by hsnoise: it is nested too deeply.") from None
     except ValueError as error:
         raise ValueError(f"{path}: not a JSON file ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -54,6 +56,15 @@ def read_model(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, np.nd
             f"{content.get('hsnoise_version')}; this version reads format {FORMAT_VERSION}."
         )
     return content, _arrays(Path(path), content["arrays"]) if "arrays" in content else {}
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object, in which a name that is given twice would silently win over itself."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is given twice")
+    return found
 
 
 def _arrays(path: Path, stated: Any) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hsnoise.cli.loading import model_of
 from hsnoise.model import NoiseModel, sample
 
 SAMPLE_SHAPE = (480, 640)
+BYTES_DRAWN, BYTES_KEPT = 40, 6  # a pixel: while a frame is drawn, and of each frame until the file is written
 # Metadata that formats other than .npz hold, and the defaults of `hsnoise.load` for missing ones.
 HELD = {".npy": (), ".tif": ("exposure_s",), ".tiff": ("exposure_s",), ".fits": ("exposure_s", "kind", "cfa")}
 BARE = {  # Python that reads the counts alone
@@ -42,14 +44,28 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"--mean-e: expected photoelectrons above 0, got {args.mean_e:g}")
     if args.shape is not None and args.clean is not None:
         raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
+    if args.out.is_dir():
+        raise ValueError(f"--out: expected a file, but {args.out} is a folder")
     model = model_of(args.model, "MODEL")
     exposures_s = args.exposure or [model.exposure_s]
-    dark = np.zeros(args.shape or SAMPLE_SHAPE, np.float32)
-    clean = dark if args.clean is None else _clean(args.clean, args.mean_e, model)
+    shape = args.shape or SAMPLE_SHAPE
+    _check_memory(len(exposures_s) * args.frames, shape)
+    clean = np.zeros(shape, np.float32) if args.clean is None else _clean(args.clean, args.mean_e, model)
     counts = draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = metadata_of(model, exposures_s, "flat" if args.clean else "dark")
     write_atomically(args.out, frames_file(suffix, counts, metadata))
     print("\n".join(_told(args.out, counts, metadata)))
+
+
+def _check_memory(frames: int, shape: tuple[int, int]) -> None:
+    """Raise ValueError if so many frames do not fit into this machine's memory."""
+    needed = BYTES_DRAWN * shape[0] * shape[1] + BYTES_KEPT * frames * shape[0] * shape[1]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else np.inf
+    if needed > memory:
+        raise ValueError(
+            f"--shape: {frames} frames of {shape[0]} x {shape[1]} pixels take {needed / 2**30:.3g} GiB, and this"
+            f" machine has {memory / 2**30:.3g}; draw fewer or smaller ones, several times with other seeds"
+        )
 
 
 def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]:

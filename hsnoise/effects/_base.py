@@ -271,7 +271,7 @@ class AbstractEffect(eqx.Module):
                 continue
             if not isinstance(value, jax.Array):
                 expected = "a number or one for each channel" if spec.per_channel else "a number"
-                raise TypeError(f"{self.name}.{field}: expected {expected}, got {value!r}.")
+                raise TypeError(f"{self.name}.{field}: expected {expected}, got {value!r:.60}.")
             low = -np.inf if spec.low is None else spec.low
             high = np.inf if spec.high is None else spec.high
             value = np.asarray(value)

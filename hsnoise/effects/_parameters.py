@@ -60,7 +60,7 @@ def _as_leaf(x):
         return x
     try:
         return jnp.asarray(x, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return x  # no number: `__check_init__`, which knows the parameter's name, says so
 
 

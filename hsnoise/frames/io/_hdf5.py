@@ -11,6 +11,8 @@ import numpy as np
 
 from hsnoise.frames.io._recording import Recording, lazy_frames, naming, recordings
 
+METADATA = ("exposure_s", "kind", "black_level", "white_level", "cfa", "shutter", "iso", "temperature_c")
+LEAST_DECLARED, MOST_PACKED = 1 << 20, 1000  # bytes; noise is hardly packed by a factor of ten
 EXPOSURE_FROM = "'exposure_s' in the HDF5 file"
 
 
@@ -26,7 +28,7 @@ def read(path: Path) -> list[Recording]:
     with naming(path), h5py.File(path, "r") as file:
         if "counts" not in file:
             raise ValueError(f"expected a data set 'counts', got {sorted(file)}")
-        counts = file["counts"]
+        counts = _data_set(file)
         if len(counts.shape) not in (3, 4):
             raise ValueError(
                 f"expected counts [frame, row, column] or [exposure, frame, row, column], got shape {counts.shape}"
@@ -36,9 +38,30 @@ def read(path: Path) -> list[Recording]:
         groups = [
             lazy_frames(path, partial(_read_frame, place=place), n, (rows, columns), counts.dtype) for place in places
         ]
-        beside = {name: file[name][()] for name in file if name != "counts" and file[name].size < counts.size}
-        metadata = dict(file.attrs) | dict(counts.attrs) | beside
-        return recordings(path, groups, {name: _text(value) for name, value in metadata.items()})
+        beside = {name: _data_set(file, name)[()] for name in METADATA if name in file}
+        metadata = _attributes(file) | _attributes(counts) | beside
+        return recordings(path, groups, {name: _text(name, value) for name, value in metadata.items()})
+
+
+def _data_set(file: h5py.File, name: str = "counts") -> h5py.Dataset:
+    """A data set of this file. Raises ValueError for one that is elsewhere, empty, or declared but not written."""
+    if isinstance(file.get(name, getlink=True), h5py.ExternalLink):
+        raise ValueError(f"{name!r} is a link to another file, which is not followed; give that file")
+    found = file.get(name)
+    if not isinstance(found, h5py.Dataset):
+        raise ValueError(f"expected a data set {name!r}, got {'a broken link' if found is None else 'a group'}")
+    if found.is_virtual or found.external:
+        raise ValueError(f"the values of {name!r} are in another file, which is not followed; give that file")
+    if found.shape is None:
+        raise ValueError(f"the data set {name!r} is empty")
+    held, declared = found.id.get_storage_size(), found.size * found.dtype.itemsize
+    if found.size and declared > LEAST_DECLARED and held * MOST_PACKED < declared:
+        raise ValueError(f"{name!r} declares {declared:.3g} bytes and holds {held}: was the file written to its end?")
+    return found
+
+
+def _attributes(of: h5py.Group | h5py.Dataset) -> dict[str, Any]:
+    return {name: of.attrs[name] for name in METADATA if name in of.attrs}
 
 
 def _read_frame(path: Path, index: int, *, place: tuple[int, ...]) -> np.ndarray:
@@ -46,10 +69,13 @@ def _read_frame(path: Path, index: int, *, place: tuple[int, ...]) -> np.ndarray
         return file["counts"][(*place, index)]
 
 
-def _text(value: Any) -> Any:
-    """HDF5 strings, bytes or arrays of them, as str."""
+def _text(name: str, value: Any) -> Any:
+    """HDF5 strings, bytes or arrays of them, as str. Raises ValueError if they are not in UTF-8."""
     array = np.asarray(value)
     if array.dtype.kind in "SO":
-        words = [one.decode() if isinstance(one, bytes) else one for one in array.ravel()]
+        try:
+            words = [one.decode() if isinstance(one, bytes) else one for one in array.ravel()]
+        except UnicodeDecodeError:
+            raise ValueError(f"{name}: expected text in UTF-8, got {value!r:.60}") from None
         return np.array(words).reshape(array.shape)
     return value

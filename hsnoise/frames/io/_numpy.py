@@ -27,7 +27,10 @@ def read(path: Path) -> list[Recording]:
     """
     with naming(path):
         if path.suffix.lower() == ".npy":
-            return recordings(path, _groups(np.load(path, mmap_mode="r")), {})
+            found = np.load(path, mmap_mode="r")
+            if not isinstance(found, np.ndarray):
+                raise ValueError("it is an archive of several arrays; give it the suffix .npz")
+            return recordings(path, _groups(found), {})
         if not zipfile.is_zipfile(path):
             raise ValueError("it is not an .npz file, or it is truncated")
         with path.open("rb") as file, np.load(file) as arrays:

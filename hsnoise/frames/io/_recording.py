@@ -96,6 +96,14 @@ def _in_seconds(value: Any) -> np.ndarray:
     return array / np.timedelta64(1, "s") if array.dtype.kind == "m" else array
 
 
+def _values(name: str, value: Any) -> list[Any]:
+    """One value or several of a field. Raises ValueError for text where numbers are expected."""
+    values = np.atleast_1d(_in_seconds(value))
+    if name != "kind" and values.dtype.kind not in "biuf":
+        raise ValueError(f"{named(name)}: expected numbers, got {values.tolist()!r:.60}")
+    return values.tolist()
+
+
 def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> list[Recording]:
     """One `Recording` for each exposure group of an array file with named metadata.
 
@@ -110,7 +118,7 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
     """
     per_group = {}
     for name in ("exposure_s", "kind", "temperature_c"):
-        values = np.atleast_1d(_in_seconds(metadata[name])).tolist() if name in metadata else [None] * len(groups)
+        values = _values(name, metadata[name]) if name in metadata else [None] * len(groups)
         if len(values) != len(groups) and (len(values) > 1 or name == "exposure_s"):
             raise ValueError(f"{named(name)}: expected {len(groups)} values (one an exposure), got {len(values)}")
         per_group[name] = values * len(groups) if len(values) < len(groups) else values

@@ -1,0 +1,157 @@
+"""Files that are broken on purpose: one sentence that names the file and what is wrong, and nothing outside is read."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise._core.output import read_image, write_atomically
+from hsnoise.cli.main import main
+
+
+def counts(n: int = 3) -> np.ndarray:
+    return np.random.default_rng(1).integers(90, 110, (n, 16, 24)).astype(np.uint16)
+
+
+def group(file):
+    file.create_group("counts")
+
+
+def empty(file):
+    file.create_dataset("counts", data=h5py.Empty("u2"))
+
+
+def external(file):
+    with h5py.File(f"{file.filename}.secret", "w") as other:
+        other["counts"] = counts()
+    file["counts"] = h5py.ExternalLink(f"{file.filename}.secret", "/counts")
+
+
+def virtual(file):
+    with h5py.File(f"{file.filename}.secret", "w") as other:
+        other["counts"] = counts()
+    layout = h5py.VirtualLayout((3, 16, 24), "u2")
+    layout[:] = h5py.VirtualSource(f"{file.filename}.secret", "counts", (3, 16, 24))
+    file.create_virtual_dataset("counts", layout)
+
+
+def broken_link(file):
+    file["counts"] = h5py.SoftLink("/nowhere")
+
+
+def never_written(file):
+    file.create_dataset("counts", shape=(100, 100_000, 100_000), dtype="u2", chunks=(1, 1000, 1000))
+
+
+def not_utf8(file):
+    file["counts"] = counts()
+    file.attrs.create("kind", b"\xff\xfe", dtype=h5py.string_dtype("utf-8", 2))
+
+
+def words(file):
+    file["counts"] = counts()
+    file.attrs["exposure_s"] = "long"
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (group, "expected a data set 'counts', got a group"),
+        (empty, "the data set 'counts' is empty"),
+        (external, "'counts' is a link to another file, which is not followed"),
+        (virtual, "the values of 'counts' are in another file, which is not followed"),
+        (broken_link, "expected a data set 'counts', got a broken link"),
+        (never_written, "'counts' declares 2e\\+12 bytes and holds 0: was the file written to its end"),
+        (not_utf8, "kind: expected text in UTF-8, got"),
+        (words, "exposure_s: expected numbers, got \\['long'\\]"),
+    ],
+)
+def test_hdf5(tmp_path, make, expected):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        if make is not words:
+            file.attrs["exposure_s"] = 1.0
+        make(file)
+    with pytest.raises(ValueError, match=f"cannot read .*a.h5: {expected}"):
+        hsnoise.load(tmp_path / "a.h5")
+
+
+def test_frames_of_zeros_that_pack_well_are_no_unwritten_file(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("counts", data=np.repeat(counts(1), 400, 0), compression="gzip", chunks=(400, 16, 24))
+        file.attrs["exposure_s"] = 1.0
+    assert hsnoise.load(tmp_path / "a.h5").n_frames == (400,)
+
+
+def test_archives_and_objects_that_are_called_npy(tmp_path):
+    np.savez(tmp_path / "a.npz", counts=counts())
+    archive, objects = tmp_path / "a.npy", tmp_path / "b.npy"
+    (tmp_path / "a.npz").rename(archive)
+    np.save(objects, np.array([{}, 1], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"a.npy: it is an archive of several arrays; give it the suffix .npz"):
+        hsnoise.load(archive, exposure_s=1)
+    with pytest.raises(ValueError, match=r"a.npy: expected one array, got an archive"):
+        read_image(archive)
+    with pytest.raises(ValueError, match=r"b.npy: cannot be read as an array of numbers"):
+        read_image(objects)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda text: "[" * 10_000 + "]" * 10_000, "it is nested too deeply"),
+        (lambda text: text.replace("51.7", "9" * 400), "dark_current.rate: expected a number, got 9{50,70}\\.?$"),
+        (lambda text: text.replace("51.7", "9" * 5000), "not a JSON file"),
+        (lambda text: text.replace('"cfa"', '"cfa": "mono", "cfa"', 1), "'cfa' is given twice"),
+        (lambda text: text.replace('"format_version": 1', '"format_version": 2'), "this version reads format 1"),
+        (lambda text: text.replace("51.7", "NaN"), "dark_current.rate: expected finite values"),
+        (lambda text: text.replace("51.7", "1e999"), "dark_current.rate: expected finite values"),
+    ],
+)
+def test_models(tmp_path, change, expected):
+    hsnoise.cameras.canon_5d3().save(tmp_path / "m.json")
+    text = (tmp_path / "m.json").read_text()
+    (tmp_path / "m.json").write_text(change(text))
+    with pytest.raises((ValueError, TypeError), match=expected):
+        hsnoise.NoiseModel.load(tmp_path / "m.json")
+
+
+def test_a_model_with_many_effects_is_refused_at_once(tmp_path):
+    hsnoise.cameras.canon_5d3().save(tmp_path / "m.json")
+    content = json.loads((tmp_path / "m.json").read_text())
+    content["effects"] = content["effects"][2:3] * 20_000
+    (tmp_path / "m.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="read_noise given twice"):
+        hsnoise.NoiseModel.load(tmp_path / "m.json")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--seed", "9" * 30], "--seed: expected at most 2147483648, got 9"),
+        (["--shape", "100000000x100000000"], "--shape: 8 frames of 100000000 x 100000000 pixels take"),
+        (["--shape", "0x4"], "--shape: expected ROWSxCOLUMNS"),
+        (["--frames", "0"], "--frames: expected a whole number above 0, got '0'"),
+        (["--clean", "."], "unknown image format"),
+    ],
+)
+def test_options_of_sample(tmp_path, options, expected, capsys):
+    arguments = ["sample", "canon_5d3", "--out", str(tmp_path / "a.npz"), *options]
+    try:
+        assert main(arguments) == 2
+    except SystemExit as ended:  # argparse
+        assert ended.code == 2
+    assert expected in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_place_of_a_file(tmp_path, capsys):
+    (tmp_path / "a.npz").mkdir()
+    assert main(["sample", "canon_5d3", "--out", str(tmp_path / "a.npz")]) == 2
+    assert "a.npz is a folder" in capsys.readouterr().err
+    with pytest.raises(IsADirectoryError, match="expected a file, but it is a folder: .*a.npz'"):
+        write_atomically(tmp_path / "a.npz", b"")
+    with pytest.raises(FileNotFoundError, match=r"nowhere.b.npz'$"):
+        write_atomically(tmp_path / "nowhere" / "b.npz", b"")
