@@ -44,9 +44,6 @@ from hsnoise._core.types import (
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import ArraySpec, Parameter, ParameterSpec, shortest
 
-LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
-
-
 PIXELS = "pixels"  # the random key of electrons and read noise, which share the words of a pixel
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +55,13 @@ class Parameter:
     name: str
     value: float
     spec: ParameterSpec
+
+
+def check_white_level(name: str, value: Any) -> None:
+    """Raise ValueError unless a largest count is None or a whole number that counts can hold."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if value is not None and not (is_number and 0 < value <= LARGEST_UINT32 and value == int(value)):
+        raise ValueError(f"{name}: expected a positive whole number or None, got {value!r:.60}.")
 
 
 def _as_leaf(x):

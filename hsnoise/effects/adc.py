@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.types import Counts, Frames, RandomKey
-from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._parameters import LARGEST_UINT32, check_white_level
 
 
 class ADC(AbstractEffect):
@@ -27,9 +28,7 @@ class ADC(AbstractEffect):
     white_level_dn: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        white = self.white_level_dn
-        if white is not None and not (0 < white <= LARGEST_UINT32 and white == int(white)):
-            raise ValueError(f"adc.white_level_dn: expected a positive whole number or None, got {white!r}.")
+        check_white_level("adc.white_level_dn", self.white_level_dn)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Counts:
         white = self.white_level_dn

@@ -29,6 +29,11 @@ def _factor(summary: Callable[[np.ndarray], float], doc: str) -> Any:
     return measured("1", axes, low=0, summary=lambda x: 100 * float(summary(x)), summary_unit="%", doc=doc)
 
 
+def _pair(first: Any) -> Any:
+    """A tuple, also of what JSON made a list of; anything else is refused where the map is checked."""
+    return tuple(first) if isinstance(first, list | tuple | np.ndarray) else (first,)
+
+
 class MeasuredMap(AbstractEffect):
     """Maps of one sensor: an offset, and factors on the dark current and the read noise of each pixel.
 
@@ -64,9 +69,11 @@ class MeasuredMap(AbstractEffect):
         summary_unit="DN/s",
         doc="change of each pixel's offset with exposure that is no charge; in tables its rms",
     )
-    first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=tuple)
+    first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=_pair)
 
     def check_arrays(self) -> None:
+        if len(self.first) != 2 or any(not isinstance(i, int | np.integer) or i < 0 for i in self.first):
+            raise ValueError(f"measured_map.first: expected a row and a column of the sensor, got {self.first!r:.60}.")
         shapes = {value.shape for value in self.arrays().values()}
         if len(shapes) > 1:
             raise ValueError(f"measured_map: expected maps of one shape, got {sorted(shapes)}.")

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.types import Counts, Frames, RandomKey, Scalar
-from hsnoise.effects._base import LARGEST_UINT32, AbstractEffect, Capture, Stage
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
-from hsnoise.effects._parameters import param
+from hsnoise.effects._parameters import LARGEST_UINT32, check_white_level, param
 
 
 class MissingCodes(AbstractEffect):
@@ -36,6 +36,9 @@ class MissingCodes(AbstractEffect):
         "1", low=1, held=True, amplitude=True, absent=1, doc="digital gain: distance of two codes, DN; fits hold it"
     )
     white_level_dn: float | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        check_white_level("missing_codes.white_level_dn", self.white_level_dn)
 
     def sample(self, signal: Frames | Counts, capture: Capture, *, key: RandomKey) -> Frames | Counts:
         steps = capture.rounded(signal.astype(self.gain.dtype) / self.gain)

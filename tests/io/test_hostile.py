@@ -155,3 +155,16 @@ def test_a_folder_in_place_of_a_file(tmp_path, capsys):
         write_atomically(tmp_path / "a.npz", b"")
     with pytest.raises(FileNotFoundError, match=r"nowhere.b.npz'$"):
         write_atomically(tmp_path / "nowhere" / "b.npz", b"")
+
+
+@pytest.mark.parametrize("white", [-1, 0, float("nan"), float("inf"), 2.5, "a", {}, True, 10**12])
+@pytest.mark.parametrize("effect", [hsnoise.effects.ADC, lambda white: hsnoise.effects.MissingCodes(2.0, white)])
+def test_white_levels_that_are_none(effect, white):
+    with pytest.raises(ValueError, match="white_level_dn: expected a positive whole number or None, got"):
+        effect(white)
+
+
+@pytest.mark.parametrize("first", [3, "ab", (1,), (-1, 0), (0.5, 0), None])
+def test_maps_that_begin_nowhere(first):
+    with pytest.raises(ValueError, match="measured_map.first: expected a row and a column of the sensor, got"):
+        hsnoise.effects.MeasuredMap(np.zeros((4, 6)), first=first)
