@@ -38,6 +38,7 @@ from hsnoise.cli.telling import (
 )
 from hsnoise.criticism import Comparison
 from hsnoise.criticism.compare import DRAWS
+from hsnoise.criticism.outcomes import Ended
 from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation.draws import check_fits
@@ -181,7 +182,10 @@ def _improve(args: argparse.Namespace) -> int:
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
-    _show(args, story, page_of_story(story), "story.png", stack, written)
+    last = []
+    if story.ending.why in (Ended.MINUTES, Ended.STEPS):
+        last = [f"To go on: hsnoise improve {same_capture(args)} --model {args.out / 'model.json'}"]
+    _show(args, story, page_of_story(story), "story.png", stack, written=written, last=last)
     return _status(story)
 
 
@@ -212,15 +216,17 @@ def _show(
     page: Page,
     figure: str,
     stack: FrameStack,
+    *,
     written: Sequence[str] = (),
+    last: Sequence[str] = (),
     **more: Any,
 ) -> None:
-    """Draw the figure of a result, write its report, and print its page."""
+    """Draw the figure of a result, write its report, and print its page; written: other files of it; last: lines."""
     write_figure(args.out / figure, found.plot())
     _write_report(args, found, stack, **more)
     foot = [f"Written to {args.out}/: {', '.join(written)}"] if written else []
     reported = [] if args.report is None else [args.report]
-    foot += [f"Figure: {args.out / figure}", *(f"Report: {one}" for one in reported)]
+    foot += [f"Figure: {args.out / figure}", *(f"Report: {one}" for one in reported), *last]
     _tell(args, page, found, foot, [*(args.out / name for name in (*written, figure)), *reported])
 
 

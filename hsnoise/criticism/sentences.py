@@ -66,10 +66,11 @@ def unexplained(worst: Share | None) -> str:
     """The largest part of the noise that a model does not reproduce."""
     if worst is None:
         return "no component of the noise budget differs from the model's beyond chance"
-    much = "too little" if worst.closed_dn2 < worst.measured_dn2 else "too much"
+    does = "lacks" if worst.closed_dn2 < worst.measured_dn2 else "adds"
     return (
-        f"the noise budget differs most in {worst.component} at {seconds(worst.exposure_s)}: the model draws"
-        f" {worst.unexplained_dn:.2g} DN rms {much}, {100 * worst.unexplained_of_total:.2g} % of the variance of all"
+        f"the noise budget differs most in {worst.in_words} at {seconds(worst.exposure_s)}: the model {does}"
+        f" {worst.unexplained_dn:.2g} DN rms (in quadrature), {100 * worst.unexplained_of_total:.2g} % of the total"
+        " variance"
     )
 
 

@@ -22,6 +22,15 @@ from hsnoise.statistics.decomposition import COMPONENTS, STATIC, Component, deco
 
 DRAWS = 2  # of each model
 CLEAR = 2.0  # standard errors, below which a difference is chance
+IN_WORDS = {
+    "frame": "offsets of frames",
+    "row": "fixed rows",
+    "column": "fixed columns",
+    "row_x_frame": "rows that change from frame to frame",
+    "column_x_frame": "columns that change from frame to frame",
+    "pixel": "fixed pixels",
+    "temporal": "temporal noise of pixels",
+}
 MOST_OF_IT = 0.95  # of the static variance, that the effects named in a sentence hold
 
 
@@ -63,6 +72,17 @@ class Share(NamedTuple):
     def unexplained(self) -> float:
         """Distance of the model as a share of what was measured; 0 where it may be chance."""
         return self.unexplained_dn**2 / self.measured_dn2 if self.measured_dn2 > 0 else 0.0
+
+    @property
+    def in_words(self) -> str:
+        """What the component is, in words."""
+        return IN_WORDS[self.component]
+
+    @property
+    def off(self) -> str:
+        """`unexplained_dn` with a sign: - where the model lacks it, + where it draws too much; empty within chance."""
+        sign = "-" if self.closed_dn2 < self.measured_dn2 else "+"
+        return f"{sign}{self.unexplained_dn:.2g}" if self.unexplained_dn > 0 else ""
 
     @property
     def unexplained_of_total(self) -> float:
@@ -181,14 +201,13 @@ def in_words(by_effect: dict[str, float], static_dn2: float) -> str:
 
 
 def as_table(shares: Iterable[Share]) -> Table:
-    """The shares as a table, in per cent, and the rms that is missing or too much; only of what is there or drawn."""
+    """The shares as a table, in per cent, and the rms that is missing (-) or too much; only what is there or drawn."""
     table = Table("exposure", "colour", "component", "DN²", "of all", "named", "only measured", "unexplained", "DN rms")
     for one in shares:
         if max(one.measured_dn2, one.closed_dn2) > CLEAR * one.error_dn2:
             percent = [f"{100 * x:.1f} %" for x in (one.of_total, one.named, one.only_measured, one.unexplained)]
-            off = f"{one.unexplained_dn:.2g}" if one.unexplained_dn > 0 else ""
             variance = f"{max(one.measured_dn2, 0.0):.4g}"
-            table.add_row(seconds(one.exposure_s), one.channel, one.component, variance, *percent, off)
+            table.add_row(seconds(one.exposure_s), one.channel, one.component, variance, *percent, one.off)
     return table
 
 

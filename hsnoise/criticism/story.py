@@ -103,7 +103,8 @@ class Story:
             light = Light.RED
         else:
             light = last.light if self.finished and self.steps[-1].comparison.fits else Light.AMBER
-        doubt = "" if last.light == Light.GREEN else last.sentence
+        # "Usable" of the last fit would contradict a red light.
+        doubt = last.rest if light == Light.RED != last.light else "" if last.light == Light.GREEN else last.sentence
         found = self.steps[-1].diagnosis
         ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
         added = [step.added for step in self.steps if step.added]

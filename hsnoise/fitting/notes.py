@@ -104,7 +104,7 @@ def _dark_current_note(value: float, error: float, result: FitResult) -> str | N
         longest = max(exposures)
         return (
             f"{near_zero('dark_current.rate', value, error, 'e-/s')};"
-            f" darks longer than {longest:g} s would determine it."
+            f" darks longer than {longest:.3g} s would determine it."
         )
     return None
 

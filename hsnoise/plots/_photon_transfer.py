@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -85,7 +86,8 @@ def _darks(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     t = np.linspace(0.0, summary.exposure_s.max() * 1.05, CURVE_POINTS)
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
-        channel, black = histograms.channel, black_level_at(model, summary.exposure_s)[:, c]
+        with jax.enable_x64(True):
+            channel, black = histograms.channel, np.asarray(black_level_at(model, summary.exposure_s))[:, c]
         colour = COLOURS[channel]
         mean, variance, error = _within_rows(histograms, far & ~_reaches_white(histograms, summary.white_level_dn))
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION

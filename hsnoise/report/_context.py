@@ -32,6 +32,7 @@ TITLES = {
     FitResult: "A model fitted to these frames",
 }
 LIGHTS = {Light.GREEN: "Fits", Light.AMBER: "With doubts", Light.RED: "Do not use this"}
+LIGHTS_OF_COMPARISON = {Light.GREEN: "Fits", Light.AMBER: "Comes close", Light.RED: "Does not fit"}
 LETTER = 0.95  # width in percent of a desktop's bar, of a name within a part of it
 
 
@@ -55,7 +56,7 @@ def context(
         "title": TITLES[type(found)],
         "made": f"hsnoise {version('hsnoise')}, {date.today().isoformat()}, seed {seed}",
         "conclusion": said,
-        "light": LIGHTS[said.light],
+        "light": (LIGHTS_OF_COMPARISON if isinstance(found, Comparison) else LIGHTS)[said.light],
         "said": (said.head, said.rest),
         "capture": capture(stack, files),
         "parameters": parameters(fit),
@@ -177,11 +178,11 @@ def left_by(comparison: Comparison, story: Story | None) -> list[dict[str, str]]
     off = sorted((one for one in shares if one.unexplained_dn > 0), key=lambda one: -one.unexplained_of_total)
     return [
         {
-            "component": one.component,
+            "component": one.in_words,
             "where": " ".join(("" if one.channel == "mono" else one.channel, seconds(one.exposure_s))).strip(),
             "measured": f"{max(one.measured_dn2, 0.0):.3g}",
             "model": f"{max(one.closed_dn2, 0.0):.3g}",
-            "off": f"{one.unexplained_dn:.2g}",
+            "off": one.off.replace("-", "\N{MINUS SIGN}"),
             "share": f"{100 * one.unexplained_of_total:.2g} %",
         }
         for one in off[:MOST_SHARES]

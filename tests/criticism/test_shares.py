@@ -47,12 +47,14 @@ def test_a_missing_effect_shows_in_its_component_at_its_size(effect, component, 
     assert worst.component == component and worst.closed_dn2 < worst.measured_dn2
     green = [one for one in found.shares if one.component == component and one.channel == "G"]
     assert np.mean([one.unexplained_dn for one in green]) == pytest.approx(size_e * gain, rel=0.35)
-    assert f"{component} at" in found.unexplained and "too little" in found.unexplained
+    assert f"{worst.in_words} at" in found.unexplained and "the model lacks" in found.unexplained
+    assert worst.off == f"-{worst.unexplained_dn:.2g}"
 
 
 def test_noise_that_is_not_there_is_too_much():
     found = hsnoise.compare(CAMERA.add(fx.FrameOffset(4.0)), capture(CAMERA, frames=24), draws=16)
-    assert found.largest_unexplained.component == "frame" and "too much" in found.unexplained
+    assert found.largest_unexplained.component == "frame" and "the model adds" in found.unexplained
+    assert found.largest_unexplained.off.startswith("+")
 
 
 def test_single_frames_have_no_shares():

@@ -99,7 +99,10 @@ def _against_a_fit(
         return "there are neither darks nor flats", "Darks of several exposures, eight frames of each."
     clipped = [g for g in darks if np.mean([frame.clipped_share for frame in g.frames]) > MOSTLY_CLIPPED]
     if darks and len(clipped) == len(darks):
-        return "most of the darks are clipped at 0", "The same darks with a higher offset (black level) of the camera."
+        return (
+            "too many counts of the darks are clipped at 0",
+            "The same darks with a higher offset (black level) of the camera.",
+        )
     prints = [frame.fingerprint for group in facts.groups for frame in group.frames]
     if len(set(prints)) <= len(facts.groups) and len(prints) > len(facts.groups):
         return "the frames of each exposure are copies of one", "Frames with a separate exposure each."
