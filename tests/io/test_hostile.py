@@ -7,6 +7,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import hsnoise
 from hsnoise._core.output import read_image, write_atomically
@@ -168,3 +169,16 @@ def test_white_levels_that_are_none(effect, white):
 def test_maps_that_begin_nowhere(first):
     with pytest.raises(ValueError, match="measured_map.first: expected a row and a column of the sensor, got"):
         hsnoise.effects.MeasuredMap(np.zeros((4, 6)), first=first)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_fits_files_that_are_cut_short(tmp_path, packed):
+    hdu = fits.CompImageHDU if packed else fits.ImageHDU
+    path = tmp_path / ("a.fits.fz" if packed else "a.fits")
+    header = fits.Header({"EXPTIME": 1.0})
+    frames = np.random.default_rng(0).integers(0, 4000, (3, 96, 128)).astype(np.uint16)
+    fits.HDUList([fits.PrimaryHDU(), hdu(frames, header)]).writeto(path)
+    assert hsnoise.load(path).n_frames == (3,)
+    path.write_bytes(path.read_bytes()[:9000])
+    with pytest.raises(ValueError, match=r"cannot read .*a\.fits.*truncated"):
+        hsnoise.load(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ def read(path: Path) -> list[Recording]:
         ValueError: unreadable, truncated, or not exactly one image of raw frames.
     """
     with naming(path), fits.open(path, memmap=False) as file:
-        index = _image_index(file)
+        index = _complete_image(file)
         hdu = file[index]
         _check_complete(path, hdu)
         *frames, rows, columns = hdu.shape
@@ -40,6 +41,18 @@ def _read_frame(path: Path, index: int, *, hdu: int) -> np.ndarray:
     with fits.open(path, memmap=False) as file:
         section = file[hdu].section
         return np.asarray(section[index, :, :] if len(section.shape) == 3 else section[:, :])
+
+
+def _complete_image(file: fits.HDUList) -> int:
+    """`_image_index` of a file that is not cut short: Astropy only warns, and frames fail when they are read."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        index = _image_index(file)
+    for one in told:
+        if "truncated" in str(one.message):
+            raise ValueError(str(one.message))
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return index
 
 
 def _image_index(file: fits.HDUList) -> int:
