@@ -7,6 +7,7 @@ import numpy as np
 from hsnoise.criticism import rules
 from hsnoise.criticism.outcomes import Refusal, Refused
 from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.shares import largest_unexplained
 from hsnoise.criticism.story import Step
 from hsnoise.effects import AbstractEffect
 from hsnoise.fitting.result import FitResult
@@ -20,6 +21,9 @@ def why_worse(step: Step, before: Step) -> Refusal | None:
     errors = until_now.error, after.error
     if not step.fit.converged and after.error * rules.GROWTH > until_now.error and not until_now.fits:
         return Refusal(Refused.NOT_CONVERGED, *errors)
+    left, left_until_now = _wrong(step), _wrong(before)
+    if left > left_until_now + rules.BUDGET_GROWTH:
+        return Refusal(Refused.BUDGET_WORSE, left_until_now, left)
     allowed = rules.WORSE
     if after.error > until_now.error:
         # The worst group may belong to another effect that is still missing, and may vary a little.
@@ -30,6 +34,15 @@ def why_worse(step: Step, before: Step) -> Refusal | None:
     if unseen and step.held_out - before.held_out <= allowed:
         return Refusal(Refused.HELD_OUT_WORSE, before.held_out, step.held_out)
     return None
+
+
+def _wrong(step: Step) -> float:
+    """The largest share of the whole variance that a component is off by, beyond chance.
+
+    Without the fixed pattern of pixels: a few hot pixels may hold most of its variance, and those of a draw are others.
+    """
+    worst = largest_unexplained([one for one in step.comparison.shares if one.component != "pixel"])
+    return 0.0 if worst is None else worst.unexplained_of_total
 
 
 def is_there(effect: AbstractEffect, result: FitResult) -> bool:

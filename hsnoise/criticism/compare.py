@@ -47,7 +47,7 @@ class Comparison:
         skipped: statistics that this capture does not allow, and why.
         max_z_p_value: how often the largest |z| of the model's own draws is as large as `max_z`.
         shares: of each component of the noise budget of the darks, what the model does not reproduce, in per cent of
-            its variance and in DN; empty without two darks of an exposure, and for the steps of `improve`.
+            its variance and in DN; empty without two darks of an exposure.
     """
 
     error: float

@@ -135,8 +135,6 @@ def improved(
             continue
         if ending is not None:
             break
-    last = steps[-1]
-    steps[-1] = replace(last, comparison=with_shares(last.comparison, last.fit.params, portion, seed))
     story = Story(tuple(steps), ending, split)
     log.info("Improved: %s", story.ended)
     if close:
@@ -217,6 +215,7 @@ class _Work:
         """The step after `steps`."""
         tick = self.counter(_stage("comparing with the model's samples", steps), DRAWS)
         comparison = compared(result.params, self.portion, seed=self.seed, tick=tick)
+        comparison = with_shares(comparison, result.params, self.portion, self.seed)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())

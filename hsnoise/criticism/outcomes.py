@@ -39,13 +39,17 @@ class Refused(StrEnum):
     NOT_CONVERGED = "not converged"  # and the error hardly fell
     STATISTICS_WORSE = "statistics worse"
     HELD_OUT_WORSE = "held-out frames worse"
+    BUDGET_WORSE = "noise budget worse"
     ZERO = "compatible with zero"
     NO_CHANGE = "no change by itself"
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a candidate was left out, with the error before and after, or the held-out log-likelihood, nats."""
+    """Why a candidate was left out, with the error before and after.
+
+    Or with the held-out log-likelihood, nats, or the share of the variance that is wrong.
+    """
 
     why: Refused
     before: float = math.nan

@@ -37,6 +37,7 @@ REFUSED = {
     Refused.NOT_CONVERGED: "no fit with it converged, and the error hardly fell ({went})",
     Refused.STATISTICS_WORSE: "statistics fit worse with it (error {went})",
     Refused.HELD_OUT_WORSE: "held-out frames fit worse with it, by {less:.1f} nats",
+    Refused.BUDGET_WORSE: "with it a component of the noise that was right is off by {share:.0f} % of the variance",
     Refused.ZERO: "came out compatible with zero",
     Refused.NO_CHANGE: "made no difference by itself",
 }
@@ -201,7 +202,7 @@ def errors_so_far(errors: Sequence[float]) -> str:
 def refusal(of: Refusal) -> str:
     """Why a candidate was left out."""
     went = f"{number(of.before)} -> {number(of.after)}"
-    return REFUSED[of.why].format(went=went, less=of.before - of.after)
+    return REFUSED[of.why].format(went=went, less=of.before - of.after, share=100 * of.after)
 
 
 def ended_in_short(ending: Ending, missing: str) -> str:

@@ -111,7 +111,8 @@ def shares_of(
     found = []
     for (i, channel), measured in _components(frames).items():
         parts = {name: [one[i, channel] for one in of] for name, of in drawn.items()}
-        found += _shares(float(frames.exposure_s[i]), channel, measured, parts["named"], parts["closed"])
+        at = float(frames.exposure_s[i]), channel
+        found += _shares(*at, measured, parts["named"], parts["closed"], same_pixels=closed is not None)
     return tuple(found)
 
 
@@ -120,11 +121,18 @@ Place = tuple[int, str]  # number of the exposure, colour
 
 
 def _shares(
-    exposure_s: float, channel: str, measured: Components, named: list[Components], closed: list[Components]
+    exposure_s: float,
+    channel: str,
+    measured: Components,
+    named: list[Components],
+    closed: list[Components],
+    *,
+    same_pixels: bool,
 ) -> Iterator[Share]:
     total = sum(max(one.variance_dn2, 0.0) for one in measured.values())
     for name, one in measured.items():
-        error = np.hypot(_chance(name, one), _chance(name, closed[0][name]) / np.sqrt(DRAWS))
+        errors = [_error(name, part, same_pixels) for part in (one, closed[0][name])]
+        error = np.hypot(errors[0], errors[1] / np.sqrt(DRAWS))
         whole, by_names = (_mean(name, of) for of in (closed, named))
         yield Share(exposure_s, channel, name, one.variance_dn2, float(error), whole, by_names, max(total, 1e-300))
 
@@ -177,9 +185,9 @@ def _mean(name: str, of: list[Components]) -> float:
     return float(np.mean([one[name].variance_dn2 for one in of]))
 
 
-def _chance(name: str, of: Component) -> float:
-    """Standard error of a variance; of static ones only that by chance, as the pixels are the same."""
-    return of.chance_dn2 if name in STATIC else of.standard_error_dn2
+def _error(name: str, of: Component, same_pixels: bool) -> float:
+    """Standard error of a variance; of static ones only that by chance where the model has this sensor's maps."""
+    return of.chance_dn2 if same_pixels and name in STATIC else of.standard_error_dn2
 
 
 def in_words(by_effect: dict[str, float], static_dn2: float) -> str:
