@@ -286,7 +286,7 @@ def test_bad_input_is_refused(call, error, message):
 def test_an_addition_is_judged_by_all_groups(groups, held_out, converged, worse):
     def step(groups, held_out, converged=True):
         error = max(groups.values()) / 2
-        comparison = SimpleNamespace(error=error, groups=groups, fits=error < rules.FITS)
+        comparison = SimpleNamespace(error=error, groups=groups, fits=error < rules.FITS, shares=())
         return Step(SimpleNamespace(params=MODEL, converged=converged), comparison, None, None, held_out, ())
 
     found = why_worse(step(groups, held_out, converged), step({"frames": 35.0, "columns": 20.0}, 0.0))
