@@ -90,8 +90,8 @@ def numbers(name: str, value: Any, length: int, per: str) -> np.ndarray:
     """Numbers as float64 `[length]`; a scalar is accepted for length 1."""
     try:
         array = np.atleast_1d(np.array(value, np.float64))
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{named(name)}: expected numbers, got {value!r}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TypeError(f"{named(name)}: expected numbers, got {value!r:.60}") from error
     if array.shape != (length,):
         raise ValueError(f"{named(name)}: expected {length} (one for each {per}), got shape {array.shape}: {value!r}")
     array.setflags(write=False)

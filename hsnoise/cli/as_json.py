@@ -63,6 +63,7 @@ def _(found: Comparison) -> dict[str, Any]:
         "groups": found.groups,
         "worst": found.worst,
         "shares": [_share(one) for one in found.shares],
+        "unexplained": found.unexplained,
         "statistics": [dict(zip(names, row, strict=True)) for row in found.table],
         "skipped": found.skipped,
     }
@@ -132,7 +133,7 @@ def _share(one: Share) -> dict[str, Any]:
         "component": one.component,
         "measured_dn2": one.measured_dn2,
         "model_dn2": one.closed_dn2,
-        "unexplained_dn": one.unexplained_dn,
+        "unexplained_dn": -one.unexplained_dn if one.closed_dn2 < one.measured_dn2 else one.unexplained_dn,
         "unexplained_of_total": one.unexplained_of_total,
     }
 

@@ -46,6 +46,7 @@ class Comparison:
             likelihood. It is held out if the model was fitted to other frames.
         skipped: statistics that this capture does not allow, and why.
         max_z_p_value: how often the largest |z| of the model's own draws is as large as `max_z`.
+        whole_budget: whether `shares` are of all dark exposures: there are two frames of each.
         shares: of each component of the noise budget of the darks, what the model does not reproduce, in per cent of
             its variance and in DN; empty without two darks of an exposure.
     """
@@ -59,6 +60,7 @@ class Comparison:
     skipped: tuple[str, ...]
     max_z_p_value: float = float("nan")
     shares: tuple[Share, ...] = ()
+    whole_budget: bool = False
 
     @property
     def fits(self) -> bool:
@@ -89,7 +91,9 @@ class Comparison:
         light = Light.AMBER if is_close else Light.RED
         if self.error < rules.FITS:
             return Conclusion(light, sentences.fails_in_one(self.error, self.max_z, self.worst[0]))
-        right = sentences.right_in_variance(self.largest_unexplained) if self.shares else ""
+        # Flats and levels are not in the budget, nor single frames.
+        is_told = self.whole_budget and self.worst_group != "level" and not self.worst_group.startswith("flats")
+        right = sentences.right_in_variance(self.largest_unexplained) if is_told else ""
         return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close), right)
 
     @property
@@ -180,8 +184,10 @@ def with_shares(found: Comparison, params: NoiseModel, portion: Portion, seed: i
     repeated = [i for i, frames in enumerate(darks.n_frames) if frames > 1]
     if not repeated:
         return found
-    key = key_for(seed, Purpose.SHARES)
-    return replace(found, shares=shares.shares_of(params, darks.select(exposures=repeated), key))
+    key, whole = key_for(seed, Purpose.SHARES), len(repeated) == darks.n_exposures
+    of_budget = () if whole else ("the noise budget leaves out exposures of a single frame",)
+    known = shares.shares_of(params, darks.select(exposures=repeated), key)
+    return replace(found, shares=known, whole_budget=whole, skipped=(*found.skipped, *of_budget))
 
 
 def compared(

@@ -66,23 +66,27 @@ def fails_in_one(error: float, max_z: float, worst: str) -> str:
 def unexplained(worst: Share | None) -> str:
     """The largest part of the noise that a model does not reproduce."""
     if worst is None:
-        return "no component of the noise budget differs from the model's beyond chance"
+        return "no component of the noise budget of the darks differs from the model's beyond chance"
     does = "lacks" if worst.closed_dn2 < worst.measured_dn2 else "adds"
+    where = seconds(worst.exposure_s) + ("" if worst.channel == "mono" else f", {worst.channel}")
+    share = worst.unexplained_of_total
+    much = f"{100 * share:.2g} %" if share < 1 else f"{number(share)} times"
     return (
-        f"the noise budget differs most in {worst.in_words} at {seconds(worst.exposure_s)}: the model {does}"
-        f" {worst.unexplained_dn:.2g} DN rms (in quadrature), {100 * worst.unexplained_of_total:.2g} % of the total"
-        " variance"
+        f"the noise budget of the darks differs most in {worst.in_words} ({where}): the model {does}"
+        f" {number(worst.unexplained_dn)} DN rms in quadrature, {much} of the measured variance"
     )
 
 
 def right_in_variance(worst: Share | None) -> str:
     """What a model that does not fit has right: the variance of each component; empty if it has not."""
     if worst is None:
-        return "The variance of each component of the noise is right within chance; their structure differs."
+        return (
+            "In the darks the variance of each component of the noise is right within chance; their structure differs."
+        )
     share = worst.unexplained_of_total
     if share > rules.CLOSED_SHARE:
         return ""
-    return f"The variance of each component of the noise is right within {100 * share:.1g} % of the whole."
+    return f"In the darks the variance of each component of the noise is right within {100 * share:.1g} % of the whole."
 
 
 def measure(error: float, misfit: float, own: float) -> str:

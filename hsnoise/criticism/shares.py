@@ -131,8 +131,10 @@ def _shares(
 ) -> Iterator[Share]:
     total = sum(max(one.variance_dn2, 0.0) for one in measured.values())
     for name, one in measured.items():
-        errors = [_error(name, part, same_pixels) for part in (one, closed[0][name])]
-        error = np.hypot(errors[0], errors[1] / np.sqrt(DRAWS))
+        own = _error(name, one, same_pixels)
+        of_draws = float(np.mean([_error(name, drawn[name], same_pixels) for drawn in closed]))
+        # The error of what came out low by chance is too small, that of the model too large if it draws too much.
+        error = np.hypot(max(own, np.sqrt(own * of_draws)), of_draws / np.sqrt(DRAWS))
         whole, by_names = (_mean(name, of) for of in (closed, named))
         yield Share(exposure_s, channel, name, one.variance_dn2, float(error), whole, by_names, max(total, 1e-300))
 
@@ -210,7 +212,7 @@ def in_words(by_effect: dict[str, float], static_dn2: float) -> str:
 
 def as_table(shares: Iterable[Share]) -> Table:
     """The shares as a table, in per cent, and the rms that is missing (-) or too much; only what is there or drawn."""
-    table = Table("exposure", "colour", "component", "DN²", "of all", "named", "only measured", "unexplained", "DN rms")
+    table = Table("at", "colour", "component", "DN²", "of all", "named", "only measured", "left", "left / DN")
     for one in shares:
         if max(one.measured_dn2, one.closed_dn2) > CLEAR * one.error_dn2:
             percent = [f"{100 * x:.1f} %" for x in (one.of_total, one.named, one.only_measured, one.unexplained)]

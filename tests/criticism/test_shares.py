@@ -52,7 +52,7 @@ def test_a_missing_effect_shows_in_its_component_at_its_size(effect, component, 
     assert worst.component == component and worst.closed_dn2 < worst.measured_dn2
     green = [one for one in found.shares if one.component == component and one.channel == "G"]
     assert np.mean([one.unexplained_dn for one in green]) == pytest.approx(size_e * gain, rel=0.35)
-    assert f"{worst.in_words} at" in found.unexplained and "the model lacks" in found.unexplained
+    assert f"{worst.in_words} (" in found.unexplained and "the model lacks" in found.unexplained
     assert worst.off == f"-{worst.unexplained_dn:.2g}"
 
 
@@ -69,6 +69,21 @@ def test_single_frames_have_no_shares():
     assert found.shares == () and found.unexplained == "" and found.largest_unexplained is None
     with pytest.raises(ValueError, match="stack: expected two frames or more of each exposure, got one of 20 ms"):
         shares_of(CAMERA, stack, jax.random.key(0))
+
+
+def test_exposures_of_one_frame_are_left_out_of_the_budget_and_named():
+    pair, single = capture(CAMERA, (0.02,)), capture(CAMERA.add(fx.RowNoise(8.0)), (0.2,), frames=2)
+    counts = [np.stack(list(pair.frames(0))), np.stack(list(single.frames(0)))[:1]]
+    stack = hsnoise.FrameStack(counts, EXPOSURES_S, black_level=64, white_level=65535, cfa="RGGB", shutter="global")
+    found = hsnoise.compare(CAMERA, stack, draws=16)
+    assert {one.exposure_s for one in found.shares} == {0.02} and not found.whole_budget
+    assert any("noise budget leaves out" in one for one in found.skipped)
+    assert not found.fits and "variance of each component" not in found.conclusion.sentence
+
+
+def test_a_level_that_is_off_is_no_matter_of_structure():
+    found = hsnoise.compare(hsnoise.cameras.grasshopper3(black_level_dn=80), capture(CAMERA), draws=16)
+    assert found.worst_group == "level" and "structure" not in found.conclusion.sentence
 
 
 def test_of_many_components_one_is_off_by_chance():

@@ -25,34 +25,35 @@ def read(path: Path) -> list[Recording]:
     Raises:
         ValueError: unreadable, truncated, or not exactly one image of raw frames.
     """
-    with naming(path), fits.open(path, memmap=False) as file:
-        index = _complete_image(file)
-        hdu = file[index]
-        _check_complete(path, hdu)
-        *frames, rows, columns = hdu.shape
-        header = file[0].header.copy()
-        header.update(hdu.header)
-        shape = (frames[0] if frames else 1, (rows, columns))
-        counts = lazy_frames(path, partial(_read_frame, hdu=index), *shape, _dtype(header))
-        return [Recording(path=path, counts=counts, **described(header, (rows, columns)))]
+    with naming(path), warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with fits.open(path, memmap=False) as file:
+            found = _recording(path, file)
+        # Astropy only warns of a file that is cut short, and its frames fail when they are read.
+        cut = next((str(one.message) for one in told if "truncated" in str(one.message)), None)
+        if cut is not None:
+            raise ValueError(cut)
+    for one in told:
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return [found]
+
+
+def _recording(path: Path, file: fits.HDUList) -> Recording:
+    index = _image_index(file)
+    hdu = file[index]
+    _check_complete(path, hdu)
+    *frames, rows, columns = hdu.shape
+    header = file[0].header.copy()
+    header.update(hdu.header)
+    shape = (frames[0] if frames else 1, (rows, columns))
+    counts = lazy_frames(path, partial(_read_frame, hdu=index), *shape, _dtype(header))
+    return Recording(path=path, counts=counts, **described(header, (rows, columns)))
 
 
 def _read_frame(path: Path, index: int, *, hdu: int) -> np.ndarray:
     with fits.open(path, memmap=False) as file:
         section = file[hdu].section
         return np.asarray(section[index, :, :] if len(section.shape) == 3 else section[:, :])
-
-
-def _complete_image(file: fits.HDUList) -> int:
-    """`_image_index` of a file that is not cut short: Astropy only warns, and frames fail when they are read."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        index = _image_index(file)
-    for one in told:
-        if "truncated" in str(one.message):
-            raise ValueError(str(one.message))
-        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    return index
 
 
 def _image_index(file: fits.HDUList) -> int:
