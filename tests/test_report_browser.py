@@ -194,7 +194,7 @@ def test_all_text_stands_out(name, scheme, opened):
     assert [found for found in contrasts if found[0] < CLEAR] == []
 
 
-@pytest.mark.parametrize(("name", "word"), [("one step", "With doubts"), ("compare", "Do not use this")])
+@pytest.mark.parametrize(("name", "word"), [("one step", "With doubts"), ("compare", "Does not fit")])
 def test_the_light_is_a_disc_and_a_word(name, word, opened):
     page = opened(name, 1280, "light")
     assert page.inner_text("h1").startswith(word)
