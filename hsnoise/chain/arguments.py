@@ -47,10 +47,18 @@ def checked_light(clean, cfa: str):
     return clean, low, high
 
 
+def _as_float(value) -> float:
+    """A number, infinite if it is too large for a float."""
+    try:
+        return float(value)
+    except OverflowError:
+        return np.inf
+
+
 def checked_exposure(exposure_s):
     """The exposure in seconds, checked to be one number >= 0."""
     if np.ndim(exposure_s) != 0:
         raise ValueError(f"{named('exposure_s')}: expected one number of seconds, got shape {np.shape(exposure_s)}.")
-    if not is_traced(exposure_s) and not 0 <= float(exposure_s) < np.inf:
-        raise ValueError(f"{named('exposure_s')}: expected finite seconds >= 0, got {exposure_s}.")
+    if not is_traced(exposure_s) and not 0 <= _as_float(exposure_s) < np.inf:
+        raise ValueError(f"{named('exposure_s')}: expected finite seconds >= 0, got {exposure_s!s:.60}.")
     return exposure_s

@@ -16,6 +16,7 @@ import numpy as np
 from hsnoise._core.output import write_atomically
 
 FORMAT, FORMAT_VERSION = "hsnoise noise model", 1
+PRECISIONS = ("float32", "float64")
 MARK = "format"  # the entry of an .npz file that says whose it is
 
 
@@ -55,7 +56,23 @@ def read_model(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, np.nd
             f"{path}: file format {content.get('format_version')}, written by hsnoise "
             f"{content.get('hsnoise_version')}; this version reads format {FORMAT_VERSION}."
         )
+    _check_fields(path, content)
     return content, _arrays(Path(path), content["arrays"]) if "arrays" in content else {}
+
+
+def _check_fields(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
+    """Raise ValueError unless the fields hold what `write_model` puts there; their values are checked by the model."""
+    precision = content.get("precision")
+    if precision not in PRECISIONS:
+        raise ValueError(f"{path}: precision: expected {' or '.join(PRECISIONS)}, got {precision!r:.60}.")
+    effects = content.get("effects")
+    if not isinstance(effects, list) or not effects:
+        raise ValueError(f"{path}: effects: expected a list of effects, got {effects!r:.60}.")
+    for i, effect in enumerate(effects):
+        fields = effect if isinstance(effect, dict) else {}
+        kinds = {"name": str, "parameters": dict, "settings": dict}
+        if not all(isinstance(fields.get(name), kind) for name, kind in kinds.items()):
+            raise ValueError(f"{path}: effect {i}: expected a name, parameters and settings, got {effect!r:.60}.")
 
 
 def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

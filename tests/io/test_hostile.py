@@ -100,6 +100,10 @@ def test_archives_and_objects_that_are_called_npy(tmp_path):
         read_image(objects)
 
 
+def edited(text: str, **fields) -> str:
+    return json.dumps(json.loads(text) | fields)
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -108,6 +112,11 @@ def test_archives_and_objects_that_are_called_npy(tmp_path):
         (lambda text: text.replace("51.7", "9" * 5000), "not a JSON file"),
         (lambda text: text.replace('"cfa"', '"cfa": "mono", "cfa"', 1), "'cfa' is given twice"),
         (lambda text: text.replace('"format_version": 1', '"format_version": 2'), "this version reads format 1"),
+        (lambda text: edited(text, precision=[1]), r"precision: expected float32 or float64, got \[1\]"),
+        (lambda text: edited(text, effects={}), "effects: expected a list of effects, got {}"),
+        (lambda text: edited(text, effects=[]), r"effects: expected a list of effects, got \[\]"),
+        (lambda text: edited(text, effects=[{"name": 3}]), "effect 0: expected a name, parameters and settings, got"),
+        (lambda text: edited(text, exposure_s=10**400), "exposure_s: expected finite seconds >= 0, got 10{50,60}"),
         (lambda text: text.replace("51.7", "NaN"), "dark_current.rate: expected finite values"),
         (lambda text: text.replace("51.7", "1e999"), "dark_current.rate: expected finite values"),
     ],
