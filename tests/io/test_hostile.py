@@ -58,6 +58,16 @@ def words(file):
     file.attrs["exposure_s"] = "long"
 
 
+def no_black(file):
+    file["counts"] = counts()
+    file.attrs["black_level"] = "abc"
+
+
+def no_white(file):
+    file["counts"] = counts()
+    file.attrs["white_level"] = np.nan
+
+
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -69,6 +79,8 @@ def words(file):
         (never_written, "'counts' declares 2e\\+12 bytes and holds 0: was the file written to its end"),
         (not_utf8, "kind: expected text in UTF-8, got"),
         (words, "exposure_s: expected numbers, got \\['long'\\]"),
+        (no_black, "black_level: expected finite numbers, got 'abc'"),
+        (no_white, "white_level: expected finite numbers, got nan"),
     ],
 )
 def test_hdf5(tmp_path, make, expected):
