@@ -25,7 +25,7 @@ from hsnoise.simulation.draws import check_effects, check_fits
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.reference import misfits
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
-from hsnoise.statistics.structure import explained
+from hsnoise.statistics.structure import OF_FLATS, explained
 
 DRAWS = 40
 WORST = 5  # statistics described in words
@@ -92,7 +92,7 @@ class Comparison:
         if self.error < rules.FITS:
             return Conclusion(light, sentences.fails_in_one(self.error, self.max_z, self.worst[0]))
         # Flats and levels are not in the budget, nor single frames.
-        is_told = self.whole_budget and self.worst_group != "level" and not self.worst_group.startswith("flats")
+        is_told = self.whole_budget and self.worst_group not in ("level", *OF_FLATS.values())
         right = sentences.right_in_variance(self.largest_unexplained) if is_told else ""
         return Conclusion(light, sentences.fails(self.error, self.worst_group, is_close), right)
 

@@ -128,8 +128,8 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
         if name in metadata
     }
     for name in ("black_level", "white_level", "iso"):
-        values = np.asarray(shared.get(name, 0))
-        if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+        numbers = np.asarray(shared.get(name, 0))
+        if numbers.dtype.kind not in "biuf" or not np.isfinite(numbers).all():
             raise ValueError(f"{named(name)}: expected finite numbers, got {shared[name]!r:.60}")
     return [
         Recording(path=path, counts=counts, **{name: per_group[name][i] for name in per_group}, **shared)
