@@ -65,7 +65,7 @@ def main() -> None:
         rows[name] = improved(name, place, arguments.minutes)
         with arguments.out.open("a") as file:
             file.write(json.dumps(rows[name]) + "\n")
-    print(Sheet(f"improve, {arguments.minutes:g} minutes a sensor", HEADINGS, list(rows.values())).markdown())
+    print(Sheet("improve on dark frames of real sensors", HEADINGS, list(rows.values())).markdown())
 
 
 if __name__ == "__main__":

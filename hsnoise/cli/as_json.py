@@ -133,7 +133,7 @@ def _share(one: Share) -> dict[str, Any]:
         "component": one.component,
         "measured_dn2": one.measured_dn2,
         "model_dn2": one.closed_dn2,
-        "unexplained_dn": -one.unexplained_dn if one.closed_dn2 < one.measured_dn2 else one.unexplained_dn,
+        "unexplained_dn": one.off_dn,
         "unexplained_of_total": one.unexplained_of_total,
     }
 

@@ -184,7 +184,8 @@ def _improve(args: argparse.Namespace) -> int:
     written = keep(story, args.out, source)
     last = []
     if story.ending.why in (Ended.MINUTES, Ended.STEPS):
-        last = [f"To go on: hsnoise improve {same_capture(args)} --model {args.out / 'model.json'}"]
+        named = args.out / ("model.json" if story.closed is None else "named.json")
+        last = [f"To go on: hsnoise improve {same_capture(args)} --model {named}"]
     _show(args, story, page_of_story(story), "story.png", stack, written=written, last=last)
     return _status(story)
 

@@ -67,7 +67,7 @@ def unexplained(worst: Share | None) -> str:
     """The largest part of the noise that a model does not reproduce."""
     if worst is None:
         return "no component of the noise budget of the darks differs from the model's beyond chance"
-    does = "lacks" if worst.closed_dn2 < worst.measured_dn2 else "adds"
+    does = "lacks" if worst.off_dn < 0 else "adds"
     where = seconds(worst.exposure_s) + ("" if worst.channel == "mono" else f", {worst.channel}")
     share = worst.unexplained_of_total
     much = f"{100 * share:.2g} %" if share < 1 else f"{number(share)} times"

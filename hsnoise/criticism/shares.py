@@ -79,10 +79,14 @@ class Share(NamedTuple):
         return IN_WORDS[self.component]
 
     @property
+    def off_dn(self) -> float:
+        """`unexplained_dn` with a sign: below 0 where the model lacks it, above 0 where it draws too much."""
+        return -self.unexplained_dn if self.closed_dn2 < self.measured_dn2 else self.unexplained_dn
+
+    @property
     def off(self) -> str:
-        """`unexplained_dn` with a sign: - where the model lacks it, + where it draws too much; empty within chance."""
-        sign = "-" if self.closed_dn2 < self.measured_dn2 else "+"
-        return f"{sign}{self.unexplained_dn:.2g}" if self.unexplained_dn > 0 else ""
+        """`off_dn` as printed; empty within chance."""
+        return f"{self.off_dn:+.2g}" if self.unexplained_dn > 0 else ""
 
     @property
     def unexplained_of_total(self) -> float:

@@ -103,8 +103,9 @@ class Story:
             light = Light.RED
         else:
             light = last.light if self.finished and self.steps[-1].comparison.fits else Light.AMBER
-        # "Usable" of the last fit would contradict a red light.
-        doubt = last.rest if light == Light.RED != last.light else "" if last.light == Light.GREEN else last.sentence
+        doubt = "" if last.light == Light.GREEN else last.sentence
+        if (light, last.light) == (Light.RED, Light.AMBER):
+            doubt = last.rest  # its head, "usable", would contradict the light
         found = self.steps[-1].diagnosis
         ended = sentences.ended_in_short(self.ending, "" if found is None else found.headline)
         added = [step.added for step in self.steps if step.added]
