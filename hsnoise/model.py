@@ -6,6 +6,7 @@ import dataclasses
 import importlib.metadata
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from operator import attrgetter
 from typing import Any
@@ -61,8 +62,7 @@ class NoiseModel(eqx.Module):
         for effect in effects:
             if not isinstance(effect, AbstractEffect):
                 raise TypeError(f"effects: expected instances of AbstractEffect, got {effect!r}.")
-        names = [effect.name for effect in effects]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        twice = sorted(name for name, times in Counter(effect.name for effect in effects).items() if times > 1)
         if twice:
             raise ValueError(f"effects: {', '.join(twice)} given twice; a model holds one effect per name.")
         check_shutter(shutter)

@@ -169,6 +169,7 @@ def test_row_gain_and_added_effects_have_gradients():
     assert found[1] > 0 and abs(found[1] - 2 * 1.0 * gain**2 * 31 / 32) < 5 * error[1] + 0.05 * found[1]
 
 
+@pytest.mark.slow
 def test_differentiable_counts_are_the_same_counts():
     model = hsnoise.cameras.canon_5d3(black_level_dn=8).add(fx.MissingCodes(2.3))
     plain = sample_dark(KEY, 2, (32, 32), model)

@@ -208,6 +208,7 @@ def test_the_budget_of_the_true_model_agrees():
             assert abs(a.variance_dn2 - b.variance_dn2) < 4 * error, name
 
 
+@pytest.mark.slow
 def test_of_large_frames_the_middle_is_drawn_of_the_model():
     model = sensor()
     wide = hsnoise.budget(drawn(model, n=2, shape=(32, 1200)))

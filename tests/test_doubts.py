@@ -112,6 +112,7 @@ def test_flats_of_unequal_light_are_not_taken_for_smoothed(good):
     assert not any("smoothed" in doubt for doubt in fit.doubts), fit.doubts
 
 
+@pytest.mark.slow
 def test_a_gain_that_nothing_tells_is_withheld_by_the_likelihood_too(rng):
     """Bias frames alone: 1.0 ± 18.9 DN/e- had been printed with a green light."""
     counts = np.rint(500 + 6.0 * rng.normal(size=(12, 96, 128)) + 0.8 * rng.normal(size=(12, 96, 1))).astype(np.uint16)

@@ -53,6 +53,7 @@ def canon_fit():
     return model, hsnoise.fit(capture(model))
 
 
+@pytest.mark.slow
 def test_canon_clipped_at_black_with_coloured_rows(canon_fit):
     model, result = canon_fit
     assert_recovered(result, model)
@@ -133,7 +134,8 @@ def test_model_without_row_gain_is_fitted_without():
     assert "row_gain.sigma.R" not in result.table and "row_gain" not in result.params
 
 
-@pytest.mark.parametrize("seed", [100, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (102, 103))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [100, 102, 103])
 def test_a_camera_without_row_gain_has_a_bound_for_it(seed):
     rng = np.random.default_rng(seed)
     exposure_s = (0.01, 0.1, 0.5, 2.0)
@@ -242,6 +244,7 @@ def test_frames_that_saw_light_are_called_flats():
     assert any("pass kind='flat'" in note for note in hsnoise.fit(stack).notes)
 
 
+@pytest.mark.slow
 def test_a_row_gain_that_starts_at_zero_leaves_it(canon_fit, monkeypatch):
     # A row gain of zero is a stationary point, whatever the frames say.
     def start_at_zero(summary, with_row_gain, with_clamp):
@@ -297,6 +300,7 @@ def little_memory(monkeypatch, canon_fit):
     monkeypatch.setattr(statistics, "MOST_MIB", sum(h.counts.nbytes for h in histograms) / 2**20 / 2)
 
 
+@pytest.mark.slow
 def test_a_capture_larger_than_memory_is_fitted_on_a_part_of_it_and_told(little_memory, canon_fit):
     model, _ = canon_fit
     part = hsnoise.fit(capture(model), method="line")

@@ -77,7 +77,7 @@ def test_while_modules_are_imported(delay_s, darks, tmp_path):
     assert "model.json" not in os.listdir(tmp_path / "out" if (tmp_path / "out").exists() else tmp_path)
 
 
-@pytest.mark.parametrize("twice", [False, True], ids=["once", "twice"])
+@pytest.mark.parametrize("twice", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["once", "twice"])
 def test_while_a_fit_is_compiled(twice, darks, tmp_path):
     process = start([*MODULE, "fit", str(darks), "--out", str(tmp_path / "out")])
     wait_for(process, "Fitting")
@@ -86,6 +86,7 @@ def test_while_a_fit_is_compiled(twice, darks, tmp_path):
     assert os.listdir(tmp_path / "out") == []
 
 
+@pytest.mark.slow
 def test_while_captures_are_drawn_in_threads(darks, tmp_path):
     process = start(
         [*MODULE, "compare", str(darks), "--model", "grasshopper3", "--cfa", "RGGB", "--out", str(tmp_path)]
@@ -161,6 +162,7 @@ with _interrupting.as_exception():
     assert interrupted_when_ready(code) == (0, "kept\n")
 
 
+@pytest.mark.slow
 def test_after_the_work_it_changes_nothing():
     code = """
 import time
@@ -184,7 +186,11 @@ assert threading.active_count() == 1
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
-@pytest.mark.parametrize("words", [["--help"], ["inspect"], ["sample"]], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param(["--help"], marks=pytest.mark.slow), pytest.param(["inspect"], marks=pytest.mark.slow), ["sample"]],
+    ids=lambda words: words[0],
+)
 def test_a_reader_that_is_gone_is_no_error(words, darks, tmp_path):
     more = {
         "inspect": [str(darks)],

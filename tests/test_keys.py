@@ -94,6 +94,7 @@ def test_seeds_draw_what_their_keys_draw(seed, sensor):
     np.testing.assert_array_equal(hsnoise.sample_dark(np.int64(seed), 2, (4, 6), MODEL, sensor_key=sensor), dark)
 
 
+@pytest.mark.slow
 def test_a_seed_may_be_traced_and_batched():
     def drawn(key):
         return hsnoise.sample(key, CLEAN, MODEL, sensor_key=1)

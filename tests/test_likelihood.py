@@ -124,7 +124,8 @@ def moved(model, factor):
     return eqx.tree_at(lambda m: (m["gain"].value, m["read_noise"].sigma), model, replace_fn=lambda x: x * factor)
 
 
-@pytest.mark.parametrize("shutter", [pytest.param("global", marks=pytest.mark.slow), "rolling"])
+@pytest.mark.slow
+@pytest.mark.parametrize("shutter", ["global", "rolling"])
 def test_gradient_matches_differences(shutter):
     model = camera(shutter=shutter, black_level_dn=10.0)
     summary = hsnoise.summarise(capture(model, shape=(32, 64)))
@@ -196,7 +197,7 @@ def test_rules_hold_away_from_where_they_were_made():
 @pytest.mark.parametrize(
     ("rate", "gain"),
     [
-        (1.7, 1.0),
+        pytest.param(1.7, 1.0, marks=pytest.mark.slow),
         pytest.param(0.5, 1.0, marks=pytest.mark.slow),
         pytest.param(1.0, 0.65, marks=pytest.mark.slow),
         (1.3, 1.3),
@@ -214,7 +215,12 @@ def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, ga
 # At exactly 0, coloured rows are integrated over a gain of 1e-6 in the precision of their fixed point.
 @pytest.mark.parametrize(
     ("sigma", "shutter", "rtol"),
-    [(1e-5, "global", 1e-7), (1e-5, "rolling", 1e-7), (0.0, "global", 1e-7), (0.0, "rolling", 1e-6)],
+    [
+        pytest.param(1e-5, "global", 1e-7, marks=pytest.mark.slow),
+        pytest.param(1e-5, "rolling", 1e-7, marks=pytest.mark.slow),
+        (0.0, "global", 1e-7),
+        (0.0, "rolling", 1e-6),
+    ],
 )
 def test_rows_of_a_model_without_row_gain_need_no_integral(sigma, shutter, rtol):
     model = camera(shutter=shutter, black_level_dn=20.0).remove("row_gain")

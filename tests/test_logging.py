@@ -31,6 +31,7 @@ def said(caplog, level):
     return [(r.name, r.getMessage()) for r in caplog.records if r.name.startswith("hsnoise.") and r.levelno == level]
 
 
+@pytest.mark.slow
 def test_a_fit_tells_its_stages_and_prints_nothing(caplog, capfd):
     stack = capture(MODEL)
     with caplog.at_level(logging.INFO, logger="hsnoise"):

@@ -75,7 +75,8 @@ def noise_grid(gain):
 
 
 @pytest.mark.parametrize(
-    ("black", "white"), [pytest.param(0.0, None, marks=pytest.mark.slow), (5.0, None), (2.0, 120.0)]
+    ("black", "white"),
+    [pytest.param(0.0, None, marks=pytest.mark.slow), (5.0, None), pytest.param(2.0, 120.0, marks=pytest.mark.slow)],
 )
 def test_unclip_inverts_the_moments(black, white):
     mean, variance = noise_grid(1.53)
@@ -91,6 +92,7 @@ def canon_tables():
     return make_clip_tables(1.53, nodes=40)
 
 
+@pytest.mark.slow
 def test_tables_return_what_was_clipped(canon_tables):
     mean, variance = noise_grid(1.53)
     true = canon_tables(*clipped_moments(mean, variance, gain=1.53))
@@ -247,7 +249,7 @@ def truth_of(model):
 @pytest.mark.parametrize(
     ("camera", "black", "captures"),
     [
-        (canon_5d3, 0.0, 5),
+        pytest.param(canon_5d3, 0.0, 5, marks=pytest.mark.slow),
         pytest.param(canon_5d3, 5.0, 3, marks=pytest.mark.slow),
         (canon_5d3, 128.0, 4),
         pytest.param(grasshopper3, 0.0, 5, marks=pytest.mark.slow),
@@ -302,6 +304,7 @@ def test_bias_frames_alone_have_no_dark_current():
     assert any("bias frames" in note for note in fit.notes)
 
 
+@pytest.mark.slow
 def test_single_frames_have_errors_only_from_three_exposures_on():
     assert np.isfinite(errors_of(line_fit(darks(canon_5d3, 1, frames=1)))).all()
     two = line_fit(darks(canon_5d3, 1, frames=1, exposures_s=(0.02, 0.2)))

@@ -67,7 +67,11 @@ def drawn(figure) -> bytes:
 
 
 @pytest.mark.parametrize("draw", [plots.histograms, plots.photon_transfer, plots.row_spectrum])
-@pytest.mark.parametrize("options", [{}, {"black_level_dn": 100.0, "shutter": "global", "flats": True}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param({}, marks=pytest.mark.slow), {"black_level_dn": 100.0, "shutter": "global", "flats": True}],
+    ids=str,
+)
 def test_every_figure_can_be_drawn_and_names_its_axes(draw, options):
     figure = draw(fitted(**options))
     assert drawn(figure).startswith(b"\x89PNG")
@@ -138,6 +142,7 @@ def test_photon_transfer_line_before_clipping_is_that_of_the_fit():
     np.testing.assert_allclose(offset, (gain * read) ** 2 * (1 + sigma**2) + 1 / 12, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_clipped_points_are_hollow():
     for black_level_dn, hollow in ((0.0, True), (100.0, False)):
         fit = fitted(black_level_dn)
@@ -201,6 +206,7 @@ def test_beta_rule_integrates_a_normal():
     np.testing.assert_allclose([weight.sum(), weight @ beta, weight @ (beta - 1) ** 2], [1, 1, 0.09], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_drawing_leaves_pyplot_alone():
     code = "import sys, hsnoise; hsnoise.plots.histograms; assert 'matplotlib.pyplot' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

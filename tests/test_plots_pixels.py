@@ -80,7 +80,7 @@ def drawn(figure) -> bytes:
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param((), id="mono"),
+        pytest.param((), id="mono", marks=pytest.mark.slow),
         pytest.param(("RGGB",), id="bayer", marks=pytest.mark.slow),
         pytest.param(("mono", TIMES, True), id="flats", marks=pytest.mark.slow),
     ],
@@ -106,6 +106,7 @@ def test_one_dark_exposure_has_no_transfer():
             draw(fit)
 
 
+@pytest.mark.slow
 def test_small_frames_have_figures():
     fit = hsnoise.fit(captured().select(rows=(0, 24), columns=(0, 96)), pixels="differ")
     assert {"histograms", "dark_current", "pixel_map"} <= set(plots.of_fit(fit))
@@ -213,7 +214,7 @@ def test_a_sensor_without_odd_pixels_has_an_empty_map():
     assert not figure.axes[0].collections
 
 
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("cfa", ["mono", pytest.param("RGGB", marks=pytest.mark.slow)])
 def test_budget_shows_components_and_shares_beside_those_of_the_model(cfa):
     found = hsnoise.budget(captured(cfa))
     figure = found.plot(sensor(cfa))

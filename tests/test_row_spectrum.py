@@ -88,6 +88,7 @@ def test_a_free_white_share_is_found(mixture):
     assert "row_gain.white_share" in str(free)
 
 
+@pytest.mark.slow
 def test_a_share_that_is_not_asked_for_changes_nothing(mixture):
     model, stack, _, without = mixture
     held = hsnoise.fit(stack, model=with_share(model, 0.0))

@@ -75,7 +75,7 @@ def dense_log_evidence(y, variance, covariance):
     ("sigma", "exponent", "noise", "mean"),
     [
         pytest.param(0.1, 1.0, 0.08, 1.0, marks=pytest.mark.slow),
-        (0.1, 0.5, 0.05, 1.0),
+        pytest.param(0.1, 0.5, 0.05, 1.0, marks=pytest.mark.slow),
         (0.05, 1.5, 0.02, 1.0),
         (0.05, 1.0, 0.06, 0.7),
     ],
@@ -172,6 +172,7 @@ def grouped_and_not(sigma=0.2):
     return in_groups(centres, present, sigma), one_group(lognormal_curves(nodes, centres[:2]), nodes)
 
 
+@pytest.mark.slow
 def test_groups_blocks_and_empty_places_change_nothing_for_white_rows():
     grouped, plain = grouped_and_not()
     assert not grouped.layout.filled.all()
@@ -182,7 +183,8 @@ def test_groups_blocks_and_empty_places_change_nothing_for_white_rows():
     np.testing.assert_allclose(slope, expected_slope, rtol=1e-6)
 
 
-@pytest.mark.parametrize("exponent", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
 def test_groups_blocks_and_empty_places_change_nothing_for_coloured_rows(exponent):
     grouped, plain = grouped_and_not()
 

@@ -66,7 +66,7 @@ def exact(found, summary, moved=0.0):
 @pytest.mark.parametrize(
     ("model", "kept"),
     [
-        (ALIKE, True),
+        pytest.param(ALIKE, True, marks=pytest.mark.slow),
         pytest.param(WHITE, True, marks=pytest.mark.slow),
         (WHITE, False),
         pytest.param(COLOURED, True, marks=pytest.mark.slow),
@@ -86,6 +86,7 @@ def test_is_the_gradient_of_the_likelihood(model, kept, monkeypatch):
     assert np.all(np.abs(own - expected) < 0.2 * np.sqrt((expected**2).mean(0)))
 
 
+@pytest.mark.slow
 def test_scatters_about_zero_with_the_information_as_covariance():
     """At the parameters of the draws: the two identities of any score, to the error of 200 draws."""
     model, draws = WHITE, 200

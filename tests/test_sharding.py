@@ -53,7 +53,13 @@ def on(devices: int) -> dict:
 
 
 @pytest.mark.parametrize(
-    "effects", [(), (SharedRowGain(0.1),), (RowNoise(1.0, 1.0), ColumnNoise(1.0, 1.0, after_gain=True))], ids=len
+    "effects",
+    [
+        (),
+        pytest.param((SharedRowGain(0.1),), marks=pytest.mark.slow),
+        pytest.param((RowNoise(1.0, 1.0), ColumnNoise(1.0, 1.0, after_gain=True)), marks=pytest.mark.slow),
+    ],
+    ids=len,
 )
 def test_draws_do_not_depend_on_the_batch(effects):
     model = canon_5d3().remove("adc")  # no rounding hides a difference in the last bit

@@ -94,6 +94,7 @@ def test_tiles_that_the_stride_does_not_divide_are_refused():
         next(enhance(NET, [np.zeros((8, 8, 3))], tile=7))
 
 
+@pytest.mark.slow
 def test_a_few_steps_learn():
     clean = jnp.full((4, 2, 16, 16, 3), 0.5)
     noisy = clean + 0.2 * jax.random.normal(KEY, clean.shape)

@@ -236,7 +236,14 @@ REACTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("effect", "name", "sign"), REACTIONS, ids=[effect.name for effect, *_ in REACTIONS])
+# In seconds each; other tests draw their effects.
+LONG = ("shared_row_gain",)
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "sign"),
+    [pytest.param(*one, id=one[0].name, marks=[pytest.mark.slow] if one[0].name in LONG else []) for one in REACTIONS],
+)
 def test_statistic_reacts_to_its_effect(effect, name, sign):
     names, mean, spread = clean("grasshopper3")
     found = draw("grasshopper3", effect, seed=100)

@@ -176,6 +176,7 @@ class Rough(Simulator):
         return self._draw(Plain.truth, self.key)
 
 
+@pytest.mark.slow
 def test_noise_of_slopes_is_not_taken_for_information():
     found = [_search(Plain(), Rough(None, None, 10_000 + number)) for number in range(100)]
     pulls = np.array([(y - Plain.truth) / np.sqrt(np.diagonal(covariance)) for y, covariance, *_ in found])

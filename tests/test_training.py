@@ -108,6 +108,7 @@ def test_another_run_in_the_same_folder_is_refused(folder, ended, capsys):
     assert json.loads((ended / "run.json").read_text())["seed"] == 0
 
 
+@pytest.mark.slow
 def test_another_model_of_the_same_name_is_another_run(folder, tmp_path, capsys):
     path = tmp_path / "model.json"
     for black_level_dn in (0, 64):

@@ -45,6 +45,7 @@ def test_a_damaged_file_is_told(tmp_path, damage):
         load_network(path)
 
 
+@pytest.mark.slow
 def test_arrays_of_another_network_are_told(tmp_path):
     path = tmp_path / "net.eqx"
     write_arrays(path, NET, {})

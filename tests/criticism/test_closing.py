@@ -87,6 +87,7 @@ def test_it_saves_loads_and_compares(wild, tmp_path):
     assert hsnoise.compare(again, held_out, draws=8).error < 20 < hsnoise.compare(wild.named, held_out, draws=8).error
 
 
+@pytest.mark.slow
 def test_a_bayer_sensor_of_one_exposure():
     seen, held_out = (half.select(exposures=[1]) for half in wild_sensor("RGGB", 8, (96, 128)))
     found = closed(model_of(*BASE, cfa="RGGB"), seen, held_out=held_out)

@@ -93,6 +93,7 @@ def test_statistics_of_flats_have_their_own_groups(measured):
     assert np.isfinite(measured.values).all()
 
 
+@pytest.mark.slow
 def test_model_of_the_flats_has_error_one(plain):
     assert hsnoise.compare(CAMERA, plain, draws=24).fits
 

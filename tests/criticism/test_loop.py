@@ -182,7 +182,9 @@ def test_sizes_count_not_places():
     assert is_there(fx.OddEvenPattern(-0.5), SimpleNamespace(params=MODEL, names=tuple(rows), in_dn=lambda _: rows))
 
 
-@pytest.mark.parametrize(("effect", "needed"), [(fx.Crosstalk(3e-6), False), (fx.RowNoise(1.0), True)])
+@pytest.mark.parametrize(
+    ("effect", "needed"), [pytest.param(fx.Crosstalk(3e-6), False, marks=pytest.mark.slow), (fx.RowNoise(1.0), True)]
+)
 def test_an_effect_that_can_be_taken_out_again_is_not_what_helped(effect, needed):
     model = MODEL.add(effect)
     stack = draw_capture(5, model, empty_stack())
@@ -190,6 +192,7 @@ def test_an_effect_that_can_be_taken_out_again_is_not_what_helped(effect, needed
     assert _Work(stack, Portion.of(stack), None, 0, print).needs(effect.name, step) is needed
 
 
+@pytest.mark.slow
 def test_a_large_capture_keeps_its_place_on_the_sensor():
     """A strip of the frames is drawn, and a glow or taps of the whole frames stay where they are."""
     truth = MODEL.add(fx.AmplifierGlow(60.0, 0.3)).add(fx.TapOffsets(2.0, taps=8))

@@ -39,10 +39,11 @@ def like():
     ("hidden", "start", "within"),
     [
         (fx.DarkSignalNonuniformity(1.5), fx.DarkSignalNonuniformity(0.6), {"sigma": 0.1}),
-        (
+        pytest.param(
             fx.AmplifierGlow(300.0, 0.3, 0.0, 1.0, 1.5),
             fx.AmplifierGlow(150.0, 0.5, 0.0, 1.0),
             {"scale": 0.3, "rate": 0.3},
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda value: getattr(value, "name", None),

@@ -43,7 +43,10 @@ def test_the_true_model_leaves_no_component_unexplained():
 
 @pytest.mark.parametrize(
     ("effect", "component", "size_e"),
-    [(fx.FrameOffset(2.0), "frame", 2.0), (fx.DarkSignalNonuniformity(3.0), "pixel", 3.0)],
+    [
+        pytest.param(fx.FrameOffset(2.0), "frame", 2.0, marks=pytest.mark.slow),
+        (fx.DarkSignalNonuniformity(3.0), "pixel", 3.0),
+    ],
 )
 def test_a_missing_effect_shows_in_its_component_at_its_size(effect, component, size_e):
     gain = CAMERA.table["gain.G"][0]
@@ -62,6 +65,7 @@ def test_noise_that_is_not_there_is_too_much():
     assert found.largest_unexplained.off.startswith("+")
 
 
+@pytest.mark.slow
 def test_single_frames_have_no_shares():
     frames = [np.asarray(hsnoise.sample_dark(i, 1, (64, 96), CAMERA, exposure_s=t)) for i, t in enumerate(EXPOSURES_S)]
     stack = hsnoise.FrameStack(frames, EXPOSURES_S, black_level=64, cfa="RGGB", shutter="global")
