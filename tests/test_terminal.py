@@ -21,10 +21,8 @@ from hsnoise.cli import results as _results
 from hsnoise.cli.main import main
 from hsnoise.cli.telling import Page, tell
 from hsnoise.criticism import Candidate, Diagnosis, Step, Story
-from hsnoise.criticism.closing import ClosedModel
 from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
-from hsnoise.criticism.shares import Share
 
 NOTES = tuple(f"note {i} says what the frames do not determine, at such length that it fills a line" for i in range(60))
 COMMAND_LINE = Path(__file__).parents[1] / "docs" / "command-line.md"
@@ -255,15 +253,11 @@ def test_a_red_story_does_not_call_its_last_fit_usable(doubts, found):
     assert fit.conclusion.head not in said.sentence and (fit.conclusion.rest in said.sentence) is bool(doubts)
 
 
-@pytest.mark.parametrize(("closed", "file"), [(False, "model.json"), (True, "named.json")])
-def test_a_story_that_ran_out_of_time_says_how_to_go_on(closed, file, printed, found, monkeypatch):
-    story = replace(found["improve"], ending=Ending(Ended.MINUTES, 2.0))
+@pytest.mark.parametrize(
+    ("ending", "options"), [(Ending(Ended.MINUTES, 2.0), ""), (Ending(Ended.STEPS, 3), " --max-steps 11")]
+)
+def test_a_story_that_was_stopped_says_how_to_go_on(ending, options, printed, found, monkeypatch):
     assert "To go on" not in printed("improve")
-    monkeypatch.setitem(found, "improve", story)
-    if closed:
-        share = Share(0.1, "G", "pixel", 1.0, 0.1, 1.0, 0.5, 2.0)
-        last = story.steps[-1]
-        model = ClosedModel(story.fit.params, story.fit.params, (), (), (share,), "", last.comparison, last.comparison)
-        monkeypatch.setitem(found, "improve", replace(story, closed=model))
+    monkeypatch.setitem(found, "improve", replace(found["improve"], ending=ending))
     last_line = printed("improve").splitlines()[-1]
-    assert last_line.startswith("To go on: hsnoise improve ") and last_line.endswith(f"/improve/{file}")
+    assert last_line.startswith("To go on: hsnoise improve ") and last_line.endswith(f"/improve{options} --resume")

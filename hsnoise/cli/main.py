@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ from hsnoise.cli import sample as _sample
 from hsnoise.cli.as_json import as_json
 from hsnoise.cli.loading import load_capture, model_of, same_capture
 from hsnoise.cli.progress import busy, fit_with_progress
-from hsnoise.cli.results import check_folder, improve_with_progress, keep, write_results
+from hsnoise.cli.results import check_folder, improve_with_progress, keep, story_in, write_results
 from hsnoise.cli.telling import (
     Page,
     page_of_comparison,
@@ -36,8 +37,9 @@ from hsnoise.cli.telling import (
     page_of_story,
     tell,
 )
-from hsnoise.criticism import Comparison
+from hsnoise.criticism import Comparison, Story
 from hsnoise.criticism.compare import DRAWS
+from hsnoise.criticism.limit import MOST_STEPS
 from hsnoise.criticism.outcomes import Ended
 from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
@@ -67,6 +69,7 @@ OPTIONS = {
     "model": "--model",
     "params": "--model",
     "seed": "--seed",
+    "resume": "--resume",
 }
 BROKEN_PIPE = 128 + 13  # a shell's exit code for a process ended by SIGPIPE
 
@@ -180,12 +183,13 @@ def _improve(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
+    if args.resume:
+        limits["resume"] = story_in(args.out)
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
     last = []
     if story.ending.why in (Ended.MINUTES, Ended.STEPS):
-        named = args.out / ("model.json" if story.closed is None else "named.json")
-        last = [f"To go on: hsnoise improve {same_capture(args)} --model {named}"]
+        last = [f"To go on: hsnoise improve {same_capture(args)}{_same_story(args, story)} --resume"]
     _show(args, story, page_of_story(story), "story.png", stack, written=written, last=last)
     return _status(story)
 
@@ -229,6 +233,13 @@ def _show(
     reported = [] if args.report is None else [args.report]
     foot += [f"Figure: {args.out / figure}", *(f"Report: {one}" for one in reported), *last]
     _tell(args, page, found, foot, [*(args.out / name for name in (*written, figure)), *reported])
+
+
+def _same_story(args: argparse.Namespace, story: Story) -> str:
+    """The options with which a story goes on, beside those of its capture."""
+    given = {"--out": args.out, "--model": args.model, "--seed": args.seed or None}
+    given["--max-steps"] = story.ending.limit + MOST_STEPS if story.ending.why == Ended.STEPS else None
+    return "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
 
 
 def _tell(args: argparse.Namespace, page: Page, found, foot: Sequence[str] = (), files: Sequence[Path] = ()) -> None:

@@ -153,6 +153,11 @@ def _limit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-minutes", type=minutes, metavar="M", help=text)
     parser.add_argument("--max-steps", type=count, metavar="N", help="add at most N effects")
     parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on where an earlier run with this --out ended or was stopped, with the same frames, model and seed",
+    )
+    parser.add_argument(
         "--close",
         action="store_true",
         help="end by measuring maps, spectra and distributions of this sensor; a minute or two more",

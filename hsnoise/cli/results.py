@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,13 @@ from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise.cli.progress import busy
-from hsnoise.criticism import Story
+from hsnoise.criticism import Story, write_story
 from hsnoise.criticism.improve import improved
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
+
+STORY = "story.json"  # from which `--resume` goes on
 
 
 def check_folder(path: Path) -> None:
@@ -56,8 +59,19 @@ def keep(story: Story, out: Path, source: dict[str, Any]) -> list[str]:
         story.params.save(out / "model.json", provenance={**source, "closed": story.closed.summary})
         written += ["model.npz", "named.json"]
     write_atomically(out / "story.txt", f"{story}\n".encode())
+    if not any(effect.arrays() for effect in story.fit.params):
+        write_story(out / STORY, story)
+        written.append(STORY)
     _interrupting.on_disk(f"the model so far is in {out / 'model.json'}")
     return [*written, "story.txt"]
+
+
+def story_in(out: Path) -> Path | None:
+    """The story that an earlier run left in a folder; None, and a sentence on standard error, without one."""
+    if (out / STORY).exists():
+        return out / STORY
+    print(f"- {out / STORY} is not there: starting from the beginning", file=sys.stderr)
+    return None
 
 
 def write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bool = True) -> list[str]:

@@ -11,6 +11,7 @@ from hsnoise.criticism.diagnose import Diagnosis, diagnose
 from hsnoise.criticism.improve import improve
 from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.resume import write_story
 from hsnoise.criticism.story import Step, Story
 
 __all__ = [
@@ -26,4 +27,5 @@ __all__ = [
     "compare",
     "diagnose",
     "improve",
+    "write_story",
 ]

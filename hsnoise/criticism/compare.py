@@ -18,6 +18,7 @@ from hsnoise._core.data_frames import data_frame
 from hsnoise._core.threads import in_threads
 from hsnoise.criticism import rules, sentences, shares
 from hsnoise.criticism.shares import Share
+from hsnoise.fitting.result import FitResult
 from hsnoise.frames.source import as_stack
 from hsnoise.likelihood.joint import log_likelihood
 from hsnoise.model import NoiseModel
@@ -154,11 +155,13 @@ class Comparison:
         )
 
 
-def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, progress=None, **keywords) -> Comparison:
+def compare(
+    params: NoiseModel | FitResult, stack, *, draws: int = DRAWS, seed: int = 0, progress=None, **keywords
+) -> Comparison:
     """Compare a model with measured frames, darks and flats, statistic by statistic, against the model's own draws.
 
     Args:
-        params: any NoiseModel, fitted or from a file.
+        params: any NoiseModel, fitted or from a file; or a fit, whose `params` it stands for.
         stack: a path or a list of paths, with the keywords of `hsnoise.load`; a FrameStack; or an array of counts with
             FrameStack's keywords.
         draws: captures that are drawn from the model as yardstick.
@@ -171,6 +174,7 @@ def compare(params: NoiseModel, stack, *, draws: int = DRAWS, seed: int = 0, pro
     draws, seed = whole_number("draws", draws, 8), seed_of("seed", seed)
     tick = callback("progress", progress)
     stack = as_stack(stack, **keywords)
+    params = params.params if isinstance(params, FitResult) else params
     check_fits(params, stack)
     portion = Portion.of(stack)
     check_effects(params, portion.frames)

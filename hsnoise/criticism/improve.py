@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,6 +33,7 @@ from hsnoise.criticism.outcomes import (
     side_of,
 )
 from hsnoise.criticism.ranking import Candidate
+from hsnoise.criticism.resume import read_steps
 from hsnoise.criticism.story import Step, Story
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import fit, rechecked
@@ -60,6 +62,7 @@ def improve(
     seed: int = 0,
     progress=None,
     keep=None,
+    resume: str | os.PathLike | None = None,
     **keywords,
 ) -> Story:
     """Fit a capture, find what the model lacks, add it and refit, until nothing significant is left.
@@ -80,6 +83,8 @@ def improve(
         seed: of all draws. progress: called with a sentence at each stage, "Step 1: adding row_noise; error 26.3", and
             again after each capture that is drawn, with a colon, its number, and "of 40" if it is known how many there
             will be. keep: called with the story so far, after each model that is kept, so that nothing is lost.
+        resume: file of a story (`hsnoise.criticism.write_story`) of these frames that goes on, with the same model and
+            seed, to the end that it would have reached; max_steps then counts its additions, too.
 
     Raises:
         FileNotFoundError, TypeError, ValueError: bad input, before any long work.
@@ -95,6 +100,7 @@ def improve(
         close=close,
         seed=seed,
         keep=keep,
+        resume=resume,
         **keywords,
     )
 
@@ -110,6 +116,7 @@ def improved(
     close: bool = False,
     seed: int = 0,
     keep=None,
+    resume: str | os.PathLike | None = None,
     **keywords,
 ) -> Story:
     """`improve`, reporting progress as events instead of sentences."""
@@ -125,9 +132,13 @@ def improved(
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
-    steps = replace(work, limit=NO_LIMIT).started(fit(fitted, model=model))
+    if resume is None:
+        steps = replace(work, limit=NO_LIMIT).started(work.first(model))
+    else:
+        classes = [one if isinstance(one, type) else type(one) for one in candidates]
+        steps = read_steps(resume, work.first, model, seed, classes)
     while (ending := limit.reached(sum(step.diagnosis is not None for step in steps[:-1]))) is None:
-        keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split))
+        keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split, seed=seed))
         own = [c for c in candidates if c.name not in steps[-1].fit.params]
         try:
             ending = work.seeing(steps[-1].fit).turn(steps, own)
@@ -135,7 +146,7 @@ def improved(
             continue
         if ending is not None:
             break
-    story = Story(tuple(steps), ending, split)
+    story = Story(tuple(steps), ending, split, seed=seed)
     log.info("Improved: %s", story.ended)
     if close:
         work.say(_stage("closing with measured components", steps))
@@ -167,6 +178,10 @@ class _Work:
         """Report a stage, and log it."""
         log.info("%s", event)
         self.tell(event)
+
+    def first(self, model: NoiseModel | None, follow: bool = False) -> FitResult:
+        """A fit of the effects of a model; follow: of each pixel over time, whatever the frames say."""
+        return fit(self.fitted, pixels="differ") if follow else fit(self.fitted, model=model)
 
     def seeing(self, of: FitResult) -> _Work:
         """The same work for steps of this fit: without flats if the gain is unknown."""
@@ -247,7 +262,7 @@ class _Work:
         stage = _stage("following each pixel over time", steps)
         self.say(stage)
         try:
-            result = fit(self.fitted, pixels="differ")
+            result = self.first(None, follow=True)
         except (RuntimeError, ValueError) as error:
             self.say(Event(f"pixels cannot be followed here: {error}"))
             return None

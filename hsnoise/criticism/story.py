@@ -65,6 +65,7 @@ class Story:
         split: which frames were fitted and which were held out, in a sentence; empty if all were fitted.
         closed: the last model closed with measured components, if that was asked for and came nearer.
         left_open: why it is not closed, in a sentence, if that was asked for in vain.
+        seed: of all draws.
     """
 
     steps: tuple[Step, ...]
@@ -72,6 +73,7 @@ class Story:
     split: str = ""
     closed: ClosedModel | None = None
     left_open: str = ""
+    seed: int = 0
 
     @property
     def fit(self) -> FitResult:
