@@ -159,7 +159,14 @@ def _compare(args: argparse.Namespace) -> None:
     check_fits(model, stack)
     args.out.mkdir(parents=True, exist_ok=True)
     found = _compared(model, stack, args.seed)
-    _show(args, found, page_of_comparison(found), "comparison.png", stack, fit=model)
+    last = []
+    if found.conclusion.light != Light.GREEN:
+        capture = same_capture(args)
+        last = [
+            f"What is missing: hsnoise diagnose {capture} --model {shlex.quote(args.model)}",
+            f"To add it: hsnoise improve {capture}",
+        ]
+    _show(args, found, page_of_comparison(found), "comparison.png", stack, fit=model, last=last)
 
 
 def _diagnose(args: argparse.Namespace) -> None:
@@ -205,7 +212,8 @@ def _load(args: argparse.Namespace) -> FrameStack:
     for sentence in shown:
         print(f"- {sentence}", file=sys.stderr)
     if len(stack.assumed) > len(shown):
-        print(f"- {len(stack.assumed) - len(shown)} more assumptions: --verbose", file=sys.stderr)
+        more = len(stack.assumed) - len(shown)
+        print(f"- {more} more assumption{'s' if more > 1 else ''}: --verbose", file=sys.stderr)
     return stack
 
 
