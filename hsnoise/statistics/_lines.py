@@ -67,8 +67,8 @@ def colours(sheet: Sheet, x: Exposures) -> None:
         sheet.add("row x frame", f"correlation, {label}", values[:, first, second], error)
     near = _next(x.row_frame, 3)
     sheet.add_colours("row x frame", f"correlation with the {_next_line('row', planes)}", near, 1 / np.sqrt(n_rows))
-    second = f"correlation with the {_next_line('row but one', planes)}"
-    sheet.add("row x frame", second, _next(x.row_frame, 3, 2), 1 / np.sqrt(n_rows * planes))
+    but_one = f"correlation with the {_next_line('row but one', planes)}"
+    sheet.add("row x frame", but_one, _next(x.row_frame, 3, 2), 1 / np.sqrt(n_rows * planes))
     near = _next(x.column_frame, 3)
     error = 1 / np.sqrt(n_columns * planes)
     sheet.add("column x frame", f"correlation with the {_next_line('column', planes)}", near, error)
