@@ -34,7 +34,7 @@ def codes(sheet: Sheet, x: Exposures) -> None:
     skewness, roughness, left_out, zero, white = np.moveaxis(x.codes, 2, 0)
     sheet.add_colours("level", "skewness of the quantiles", skewness, 2 / np.sqrt(n))
     sheet.add("codes", "roughness of the histogram", roughness, 0.1 / np.sqrt(planes))
-    sheet.add("codes", "share of codes left out", left_out, 0.1 / np.sqrt(planes))
+    sheet.add("codes", "share of codes left out", left_out, 0.02 / np.sqrt(planes))
     sheet.add("codes", "share at zero", zero, 0.5 / np.sqrt(n * planes))
     sheet.add("codes", "share at the white level", white, 0.5 / np.sqrt(n * planes))
 
