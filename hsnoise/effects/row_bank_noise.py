@@ -33,7 +33,7 @@ class RowBankNoise(AbstractEffect):
             Its electrons are then DN divided by the mean gain of the pixels.
 
     Reference: Kawahito, "Column-parallel ADCs for CMOS image sensors and their FoM-based evaluations", IEICE Trans.
-    Electron. E101-C, 2018 (converters on both sides of the pixels); Janesick, *Photon Transfer*, SPIE 2007.
+    Electron. E101-C, 2018 (converters of columns); Janesick, *Photon Transfer*, SPIE 2007.
     """
 
     name: ClassVar[str] = "row_bank_noise"
