@@ -11,6 +11,7 @@ import pytest
 
 import hsnoise
 from hsnoise.effects import (
+    AdcNonuniformity,
     AmplifierGlow,
     BlackClamp,
     BlackShading,
@@ -31,6 +32,7 @@ from hsnoise.effects import (
     ReadNoiseNonuniformity,
     ReadoutBandwidth,
     ReadoutOvershoot,
+    RowBankNoise,
     RowFixedPattern,
     RowNoise,
     SharedRowGain,
@@ -52,6 +54,7 @@ CAMERAS = {
 NOTHING = (
     SharedRowGain(0.0),
     RowNoise(0.0),
+    RowBankNoise(0.0),
     ColumnNoise(0.0),
     RowFixedPattern(0.0),
     ColumnFixedPattern(0.0),
@@ -71,6 +74,7 @@ NOTHING = (
     OddEvenPattern(0.0),
     TapOffsets(0.0, taps=4),
     BlackShading(0.0, 0.4),
+    AdcNonuniformity(0.0),
     MissingCodes(1.0),
     CosmicRays(0.0, 1.0),
     BlackClamp([0.0, 0.0, 0.0]),
@@ -211,6 +215,7 @@ def test_clean_draws_have_no_correlations(camera):
 REACTIONS = [
     (SharedRowGain(0.3, 1.0), "row x frame: correlation, same row of G-R, long exposures", 1),
     (RowNoise(1.5), "row x frame: correlation, same row of G-R, short exposures", 1),
+    (RowBankNoise(1.5, 1.2), "row x frame: correlation with the next row but one of the colour, short exposures", 1),
     (ColumnNoise(1.0), "column x frame: correlation, same column, short exposures", 1),
     (RowFixedPattern(1.0), "static rows: correlation of exposures, profile, short and short", 1),
     (ColumnFixedPattern(0.6), "static columns: correlation of exposures, profile, short and long", 1),
@@ -230,6 +235,7 @@ REACTIONS = [
     (OddEvenPattern(1.0), "static columns: parity, short exposures", 1),
     (TapOffsets(1.0, taps=4), "static columns: steps of 8, short exposures", 1),
     (BlackShading(1.0, 0.4), "static columns: low-order shape, short exposures", 1),
+    (AdcNonuniformity(0.3), "codes: roughness of the histogram, long exposures", 1),
     (MissingCodes(1.7), "codes: roughness of the histogram, long exposures", 1),
     (CosmicRays(1500.0, 500.0), "pixels over time: pixels with 1 outliers", 1),
     (BlackClamp([70.0, 60.0, 65.0]), "level: mean above black, DN, G, long exposures", -1),

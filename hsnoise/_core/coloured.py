@@ -21,15 +21,37 @@ def power_law(n: int, exponent: Scalar, dc: Scalar | float = 0.0) -> jax.Array:
 
     The dtype is that of the exponent. A series of length 1 has only k = 0: power 0 without `dc`.
     """
-    k = jnp.abs(jnp.fft.fftfreq(n, 1 / n)).astype(exponent.dtype)
+    return _law(_cycles(n, exponent), exponent, dc)
+
+
+def _cycles(n: int, exponent: Scalar) -> jax.Array:
+    """Cycles per series of the bins [n], in the dtype of the exponent."""
+    return jnp.abs(jnp.fft.fftfreq(n, 1 / n)).astype(exponent.dtype)
+
+
+def _law(k: jax.Array, exponent: Scalar, dc: Scalar | float) -> jax.Array:
+    """Power k^-exponent, `dc` where k is 0, scaled to a mean of 1."""
     power = jnp.where(k == 0, dc, jnp.exp(-exponent * jnp.log(jnp.maximum(k, 1.0))))
     total = power.sum()
-    return power * (n / jnp.where(total > 0, total, 1.0))
+    return power * (len(k) / jnp.where(total > 0, total, 1.0))
 
 
 def fading_power(n: int, exponent: Scalar) -> jax.Array:
     """Power law [n] whose DC term is 1 for white noise and falls to 0 at an exponent of 1 or -1."""
-    return power_law(n, exponent, jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2)
+    return power_law(n, exponent, _fading(exponent))
+
+
+def _fading(exponent: Scalar) -> jax.Array:
+    return jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2
+
+
+def power_of_banks(n: int, exponent: Scalar) -> jax.Array:
+    """Spectrum [n] of two independent series of `fading_power` that take turns.
+
+    Each has every second place, so frequencies fold at a quarter of a cycle per place. An odd n has no half a cycle.
+    """
+    k = _cycles(n, exponent)
+    return _law(jnp.minimum(k, (n + 1) // 2 - k), exponent, _fading(exponent))
 
 
 def exponent_of(correlation: float, n: int, lag: int = 1) -> float:

@@ -9,6 +9,7 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, Places, either_side
 from hsnoise.effects._parameters import Parameter, ParameterSpec, param
 from hsnoise.effects.adc import ADC
+from hsnoise.effects.adc_nonuniformity import AdcNonuniformity
 from hsnoise.effects.amplifier_glow import AmplifierGlow
 from hsnoise.effects.black_clamp import BlackClamp
 from hsnoise.effects.black_level import BlackLevel
@@ -42,6 +43,7 @@ from hsnoise.effects.read_noise import ReadNoise
 from hsnoise.effects.read_noise_nonuniformity import ReadNoiseNonuniformity
 from hsnoise.effects.readout_bandwidth import ReadoutBandwidth
 from hsnoise.effects.readout_overshoot import ReadoutOvershoot
+from hsnoise.effects.row_bank_noise import RowBankNoise
 from hsnoise.effects.row_fixed_pattern import RowFixedPattern
 from hsnoise.effects.row_gain import RowGain
 from hsnoise.effects.row_noise import RowNoise
@@ -59,6 +61,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ADC,
     SharedRowGain,
     RowNoise,
+    RowBankNoise,
     ColumnNoise,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -81,6 +84,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     OddEvenPattern,
     TapOffsets,
     BlackShading,
+    AdcNonuniformity,
     MissingCodes,
     CosmicRays,
     BlackClamp,
@@ -95,6 +99,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
 __all__ = [
     "ADC",
     "AbstractEffect",
+    "AdcNonuniformity",
     "AmplifierGlow",
     "BlackClamp",
     "BlackLevel",
@@ -135,6 +140,7 @@ __all__ = [
     "ReadNoiseNonuniformity",
     "ReadoutBandwidth",
     "ReadoutOvershoot",
+    "RowBankNoise",
     "RowFixedPattern",
     "RowGain",
     "RowNoise",

@@ -58,7 +58,8 @@ class Stage(enum.IntEnum):
     READOUT = 5  # changes the signal and its read noise in the readout chain, e-
     GAIN = 6  # multiplies; after this stage the signal is in DN
     BLACK = 7  # adds an offset, DN
-    DIGITAL = 8  # turns DN into counts, or counts into counts
+    CONVERSION = 8  # shapes the steps of the converter, DN
+    DIGITAL = 9  # turns DN into counts, or counts into counts
 
 
 class Capture(eqx.Module):

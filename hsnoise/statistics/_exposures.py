@@ -34,7 +34,7 @@ class Exposures(Lines):
     many values lie beyond TAILS and, of the frames of each pixel, beyond OUTLIER. Of the residual cut at +-5:
     powers [exposure, plane, 3], means of its square, cube and fourth power; lags [exposure, lag], mean products;
     later [exposure], mean product with the next frame; grid [exposure, plane, frame, 8, 8], sums over blocks, in units
-    of the root of their pixels. codes [exposure, plane, 4]: see `histogram_shape`.
+    of the root of their pixels. codes [exposure, plane, 5]: see `histogram_shape`.
 
     half_pixel, half_temporal [exposure, parity, plane, row, column]: pixel and temporal of the even and of the odd
     frames; empty where they are not asked for.
@@ -100,7 +100,7 @@ def exposures_of(
 ) -> Exposures:
     """Sums over the residual [exposure, plane, frame, row, column], DN; it and `spare`, as large, are overwritten.
 
-    codes [exposure, plane, 4]: of `histogram_shape`. halves: whether even and odd frames are compared.
+    codes [exposure, plane, 5]: of `histogram_shape`. halves: whether even and odd frames are compared.
     """
     n, _, frames, rows, columns = residual.shape
     squares = np.einsum("epfrc,epfrc->epfr", residual, residual).sum((2, 3), dtype=np.float64)

@@ -67,6 +67,8 @@ def colours(sheet: Sheet, x: Exposures) -> None:
         sheet.add("row x frame", f"correlation, {label}", values[:, first, second], error)
     near = _next(x.row_frame, 3)
     sheet.add_colours("row x frame", f"correlation with the {_next_line('row', planes)}", near, 1 / np.sqrt(n_rows))
+    but_one = f"correlation with the {_next_line('row but one', planes)}"
+    sheet.add("row x frame", but_one, _next(x.row_frame, 3, 2), 1 / np.sqrt(n_rows * planes))
     near = _next(x.column_frame, 3)
     error = 1 / np.sqrt(n_columns * planes)
     sheet.add("column x frame", f"correlation with the {_next_line('column', planes)}", near, error)
@@ -85,13 +87,14 @@ def colours(sheet: Sheet, x: Exposures) -> None:
         sheet.add("column x frame", "correlation with the next frame", later, 1 / np.sqrt(n_columns * planes))
 
 
-def _next(moving: np.ndarray, axis: int) -> np.ndarray:
-    """artanh of the correlation of neighbours along an axis, 2 or 3, of x [exposure, plane, frame, line].
+def _next(moving: np.ndarray, axis: int, lag: int = 1) -> np.ndarray:
+    """artanh of the correlation `lag` apart along an axis, 2 or 3, of x [exposure, plane, frame, line].
 
     Of mean 0 for white noise.
     """
     n = moving.shape[axis]
-    after, before = (moving[:, :, 1:], moving[:, :, :-1]) if axis == 2 else (moving[..., 1:], moving[..., :-1])
+    along = moving.swapaxes(2, 3) if axis == 2 else moving
+    after, before = along[..., lag:], along[..., :-lag]
     # What sums to zero over n has correlation -1/(n - 1).
     return correlation(after, before, (2, 3)) + 1 / (n - 1)
 

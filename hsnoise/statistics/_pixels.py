@@ -28,12 +28,13 @@ def levels(sheet: Sheet, x: Exposures) -> None:
 
 
 def codes(sheet: Sheet, x: Exposures) -> None:
-    """The histogram of counts: skewness, roughness, ends."""
+    """The histogram of counts: skewness, roughness, gaps, ends."""
     planes, frames, rows, columns = x.shape
     n = frames * rows * columns
-    skewness, roughness, zero, white = np.moveaxis(x.codes, 2, 0)
+    skewness, roughness, left_out, zero, white = np.moveaxis(x.codes, 2, 0)
     sheet.add_colours("level", "skewness of the quantiles", skewness, 2 / np.sqrt(n))
     sheet.add("codes", "roughness of the histogram", roughness, 0.1 / np.sqrt(planes))
+    sheet.add("codes", "share of codes left out", left_out, 0.02 / np.sqrt(planes))
     sheet.add("codes", "share at zero", zero, 0.5 / np.sqrt(n * planes))
     sheet.add("codes", "share at the white level", white, 0.5 / np.sqrt(n * planes))
 

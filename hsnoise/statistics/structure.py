@@ -71,6 +71,7 @@ WORDS = {
     "parity": "parity: even against odd rows (columns)",
     "kurtosis": "log kurtosis: weight of the tails, 0 for a normal distribution",
     "energy of ": "energy of blocks: scatter of the means of blocks of pixels",
+    "left out": "codes left out: empty ones between codes that hold many counts",
     "roughness": "roughness: how much a histogram jumps from code to code",
 }
 

@@ -15,6 +15,7 @@ from hsnoise.effects import (
     FrameOffset,
     FrameTilt,
     PeriodicBanding,
+    RowBankNoise,
     RowFixedPattern,
     RowNoise,
     TapOffsets,
@@ -69,6 +70,28 @@ def test_coloured_offsets_have_the_spectrum(effect, axis):
     assert stats.kstest(relative.ravel(), "expon").pvalue > P_VALUE
     squares = np.mean(series**2, axis=1)
     assert abs(squares.mean() - 4) < 5 * squares.std() / np.sqrt(frames)
+
+
+@pytest.mark.parametrize("rows", [64, 65])
+def test_banks_take_turns(rows):
+    """Rows of one bank are 1/f, and the other bank knows nothing of them but what is shared."""
+    frames = 3000
+
+    def correlations(effect):
+        drawn = darks(effect, frames, (rows, 2), cfa="mono")
+        np.testing.assert_array_equal(drawn, np.broadcast_to(drawn[:, :, :1], drawn.shape))
+        series = drawn[:, :, 0]
+        squares = np.mean(series**2, axis=1)
+        assert abs(squares.mean() - 4) < 5 * squares.std() / np.sqrt(frames)
+        return np.array([np.mean(series[:, lag:] * series[:, : rows - lag]) for lag in range(1, 5)]) / 4
+
+    own, both, common = (correlations(RowBankNoise(2.0, 1.0, shared)) for shared in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(own[::2], 0, atol=0.03)
+    np.testing.assert_allclose(both, (own + common) / 2, atol=0.03)
+    rho = correlations(RowNoise(2.0, 1.0))
+    np.testing.assert_allclose(common, rho, atol=0.03)
+    # A bank is a series of half the length: its neighbours are nearly as alike as those of all rows.
+    assert 0.4 < own[1] < rho[0] and both[1] > both[0] + 0.1 and both[3] > both[2] + 0.05
 
 
 @pytest.mark.parametrize(("columns", "taps"), [(64, 4), (64, 2), (50, 3)])

@@ -9,6 +9,7 @@ from scipy import stats
 
 from hsnoise.effects import (
     ADC,
+    AdcNonuniformity,
     BlackClamp,
     BlackLevel,
     Crosstalk,
@@ -181,6 +182,35 @@ def test_the_clamp_takes_the_mean_and_leaves_the_variance():
         np.testing.assert_allclose(plain - clamped, expected, rtol=1e-9)
         standard = np.sqrt(np.mean(gain**2) * (100 * exposure_s + 4) / clamped.size)
         assert abs(clamped.mean() - 64) < 5 * standard
+
+
+@pytest.mark.parametrize("period", [2, 3, 16])
+def test_codes_are_unequally_wide(period):
+    """A ramp through the converter dwells on each code as long as the code is wide."""
+    effect, steps = AdcNonuniformity(0.2, period), 200
+    ramp = np.arange(120 * period * steps).reshape(1, 120, -1) / steps + 100 * period - 0.5 + 0.5 / steps
+
+    def widths(sensor):
+        model = NoiseModel([ADC(), effect], cfa="mono", shutter="rolling", exposure_s=1.0)
+        assert model.names == ("adc_nonuniformity", "adc")
+        counts = np.asarray(sample(KEY, ramp, model, sensor_key=jax.random.key(sensor)))
+        assert abs(counts.astype(float).mean() - ramp.mean()) < 1 / steps
+        inside = counts[(counts >= 101 * period) & (counts < 219 * period)]
+        found = np.bincount(inside)[101 * period :].reshape(-1, period) / steps
+        np.testing.assert_allclose(found, np.broadcast_to(found[:1], found.shape), atol=2 / steps)
+        return found.mean(0)
+
+    found = np.array([widths(sensor) for sensor in range(40)])
+    np.testing.assert_allclose(found.mean(1), 1, atol=1 / steps)
+    rms = np.sqrt(np.square(found - 1).mean())
+    assert abs(rms / 0.2 - 1) < 5 / np.sqrt(2 * 40 * (period - 1))
+    np.testing.assert_array_equal(widths(3), found[3])
+
+
+@pytest.mark.parametrize("period", [1, 2.0, True])
+def test_impossible_periods_are_refused(period):
+    with pytest.raises(ValueError, match=r"adc_nonuniformity.period: expected a whole number of at least 2"):
+        AdcNonuniformity(0.1, period)
 
 
 def test_digital_gain_leaves_gaps_and_the_mean():

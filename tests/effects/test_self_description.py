@@ -77,6 +77,8 @@ DECLARED = [
     fx.RowNoise(2.0),
     fx.RowNoise(2.0, 1.0, after_gain=True),
     fx.RowNoise(2.0, 0.5),
+    fx.RowBankNoise(2.0, 0.5, 0.4),
+    fx.RowBankNoise(2.0, 1.2, after_gain=True),
     fx.ColumnNoise(2.0, 1.0),
     fx.RowFixedPattern(2.0, after_gain=True),
     fx.ColumnFixedPattern(2.0),

@@ -8,6 +8,7 @@ import pytest
 
 from hsnoise.effects import (
     ADC,
+    AdcNonuniformity,
     AmplifierGlow,
     BlackClamp,
     BlackLevel,
@@ -39,6 +40,7 @@ from hsnoise.effects import (
     ReadNoiseNonuniformity,
     ReadoutBandwidth,
     ReadoutOvershoot,
+    RowBankNoise,
     RowFixedPattern,
     RowNoise,
     SharedRowGain,
@@ -110,6 +112,7 @@ def test_patterns_of_two_effects_are_independent():
 NEUTRAL = [
     SharedRowGain(0.0, 1.0),
     RowNoise(0.0, 1.0),
+    RowBankNoise(0.0, 1.0, 0.4),
     ColumnNoise(0.0, 1.0),
     RowFixedPattern(0.0),
     ColumnFixedPattern(0.0),
@@ -131,6 +134,7 @@ NEUTRAL = [
     OddEvenPattern(0.0, 0.0),
     TapOffsets(0.0),
     BlackShading(0.0, 0.4),
+    AdcNonuniformity(0.0, 8),
     MissingCodes(1.0),
     CosmicRays(0.0, 1e4),
     BlackClamp(0.0),

@@ -1,0 +1,68 @@
+"""Unequal steps of the converter: differential nonlinearity (DNL)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._core.types import Frames, RandomKey, Scalar
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker
+from hsnoise.effects._parameters import param
+
+NARROWEST_DN = 1.2  # of noise over whose codes a pattern shows
+
+
+class AdcNonuniformity(AbstractEffect):
+    """Code k of the converter is 1 + d_k DN wide, d a pattern of `period` codes, of rms sigma, that the sensor keeps.
+
+    Converters work in two steps: coarse ones that are well trimmed, and a fine converter whose own errors come back in
+    each of them. The period is the number of its codes: 2 for a ramp whose counter uses both edges of a clock, 4 to 32
+    for the last stage of a pipeline or the low bits of a successive approximation. The errors of its steps are
+    independent and normal, less their mean, since the coarse step is right; all pixels have the same. No code is
+    narrower than 0. The mean error of the period is 0, so mean levels hardly change.
+
+    In dark frames: a comb in the histogram of counts, at the same codes in all exposures, that leaves no code out; in
+    captures of few codes nothing.
+
+    Attributes:
+        period: codes after which the pattern repeats, at least 2.
+
+    References: IEEE Std 1241-2010 (differential nonlinearity; its test by histogram); Doernberg, Lee, and Hodges,
+    "Full-speed testing of A/D converters", IEEE J. Solid-State Circuits 19, 1984.
+    """
+
+    name: ClassVar[str] = "adc_nonuniformity"
+    stage: ClassVar[Stage] = Stage.CONVERSION
+    sigma: Scalar = param("DN", low=0, amplitude=True, doc="rms error of the width of a code")
+    period: int = eqx.field(static=True, default=2)
+
+    def __check_init__(self):
+        if not isinstance(self.period, int) or isinstance(self.period, bool) or self.period < 2:
+            raise ValueError(f"adc_nonuniformity.period: expected a whole number of at least 2, got {self.period!r}.")
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        ends = jnp.cumsum(self._widths(capture, signal.dtype))
+        above = signal + 0.5 + jnp.mean(ends - jnp.arange(1, self.period + 1))  # where code 0 begins
+        within = jnp.mod(above, self.period)
+        code = jnp.round(above - within) + jnp.searchsorted(ends[:-1], within, side="right")
+        # By so many codes it is read wrongly; what rounds and clips is the converter itself.
+        return signal + (code - jnp.floor(signal + 0.5)).astype(signal.dtype)
+
+    def _widths(self, capture: Capture, dtype: jnp.dtype) -> jax.Array:
+        """Widths of the codes of one period on this sensor, of mean 1: [code], DN."""
+        steps = jax.random.normal(capture.fixed_key(self.name), (self.period,), dtype)
+        errors = (steps - steps.mean()) * np.sqrt(self.period / (self.period - 1)).astype(dtype)
+        widths = jnp.maximum(1 + self.sigma * errors, 0)
+        return widths / widths.mean()
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if np.hypot(facts.read_noise_e, np.sqrt(facts.signal_e)) * facts.gain.max() < NARROWEST_DN:
+            return None
+        # A few per cent show in codes that hold thousands of pixels.
+        return lambda size, rng: cls(0.04 * size, int(rng.choice([2, 4, 8, 16, 32])))
