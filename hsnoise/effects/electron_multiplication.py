@@ -15,24 +15,21 @@ from hsnoise.effects._parameters import param
 
 
 class ElectronMultiplication(AbstractEffect):
-    """n electrons read (1 - e) n + Gamma(e n) at the input of the register, e = 1 - 1/M at a multiplication of M.
+    """n electrons that a gain register multiplies by M read (1 - e) n + Gamma(e n), with the excess e = 1 - 1/M.
 
-    On its way through hundreds of stages an electron becomes a random number of them, geometric with mean M if the
-    stages are many: exponential where M is large, and then n electrons become Gamma(n, M). Referred to the input, that
-    has mean n and variance e n. (1 - e) n + Gamma(e n), divided by scale 1, has the same for any M, and the same least
-    value n/M; e = 1 is Gamma(n), e = 0 is n. Shot noise gains the excess noise factor F^2 = 1 + e = 2 - 1/M; the finite
-    number of stages takes away 1 % (536 stages, M = 300).
+    In its hundreds of stages an electron becomes a random number of electrons: geometric, and exponential if the mean M
+    is large, so that n become Gamma(n, M). Referred to the input, the mean is n and the variance e n. Both are exact
+    here for any M, and so is the least value, n/M; e = 0 is n, e = 1 the limit Gamma(n). Shot noise gains the excess
+    noise factor F^2 = 1 + e = 2 - 1/M; 536 stages instead of infinitely many take 1 % from it at M = 300.
 
-    The whole model is referred to the input: `gain` is that of the system with multiplication, DN for each electron
+    The whole model is referred to the input: `gain` is that of the camera with multiplication, DN for each electron
     that enters the register (M times the gain without), and `read_noise` is the effective one (1/M of that without).
-    It acts after all electrons are collected and before read noise.
+    The effect acts on whole electrons, after all of them are collected, and before read noise. Clock-induced charge is
+    Poisson in each pixel and frame, whatever the exposure; all of it is taken to pass the whole register.
 
-    Clock-induced charge, electrons that the clocks set free before or in the register, is Poisson in each pixel and
-    frame whatever the exposure; all of it is taken to pass the whole register.
-
-    In dark frames: the few electrons of long exposures, and of bias frames, scatter exponentially: a tail on one side
-    of the histogram. The variance alone shows no more than a gain F^2 times as large, in darks and flats alike; what
-    separates the two is the third moment of dark electrons, 3/2 of what such a gain makes of a Poisson number.
+    In dark frames: a tail towards bright pixels, because single electrons, of dark current or of the clocks, scatter
+    exponentially. The variance alone shows no more than a gain F^2 times as large, in darks and flats alike; only the
+    shape of the distribution separates the two: the third moment is 3/2 of what such a gain makes of Poisson numbers.
 
     References: Robbins, Hadwen, "The noise performance of electron multiplying charge-coupled devices", IEEE Trans.
     Electron Devices 50, 2003; Basden, Haniff, Mackay, "Photon counting strategies with low-light-level CCDs", MNRAS
@@ -42,7 +39,12 @@ class ElectronMultiplication(AbstractEffect):
     name: ClassVar[str] = "electron_multiplication"
     stage: ClassVar[Stage] = Stage.MULTIPLICATION
     excess: Scalar = param(
-        "1", low=0, high=1, amplitude=True, doc="excess noise factor F^2 minus 1: 1 - 1/M at multiplication M"
+        "1",
+        low=0,
+        high=1,
+        held="at bounds",
+        amplitude=True,
+        doc="excess noise factor F^2 minus 1, 1 - 1/M; fits hold 0 and 1",
     )
     clock_induced: Scalar = param(
         "e-",
