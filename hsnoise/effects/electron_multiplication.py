@@ -66,7 +66,7 @@ class ElectronMultiplication(AbstractEffect):
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:
         def make(size: float, rng: np.random.Generator) -> ElectronMultiplication:
-            # Registers are run at multiplications of ten or more; weak or strong is what clocks add.
-            return cls(min(size, 1.0), 0.1 * size * rng.uniform(0, 1))
+            # Registers work near the limit, but the gain of a fit without one has absorbed most of the excess.
+            return cls(min(size, 1.0), rng.uniform(0, 0.1 * size))
 
         return make
