@@ -30,6 +30,10 @@ BASE = (fx.ShotNoise(), fx.DarkCurrent(40.0), fx.ReadNoise(2.0), fx.Gain(1.5), f
         ((), ["arrivals", "gain", "black_level", "adc"]),
         ((fx.HotPixels(0.1, 100.0),), ["arrivals", "hot_pixels", "gain", "black_level", "adc"]),
         ((fx.Crosstalk(0.02),), ["arrivals", "crosstalk", "read_noise", "gain", "black_level", "adc"]),
+        (
+            (fx.ElectronMultiplication(0.9),),
+            ["arrivals", "electron_multiplication", "read_noise", "gain", "black_level", "adc"],
+        ),
         ((fx.RowNoise(1.0),), ["arrivals", "row_noise", "gain", "black_level", "adc"]),
         (
             (fx.PhotoResponseNonuniformity(0.1),),
@@ -42,7 +46,14 @@ def test_what_is_merged(more, names):
 
 
 @pytest.mark.parametrize(
-    "more", [fx.HotPixels(0.0, 100.0), fx.Crosstalk(0.0), fx.RowNoise(0.0), fx.PhotoResponseNonuniformity(0.0)]
+    "more",
+    [
+        fx.HotPixels(0.0, 100.0),
+        fx.Crosstalk(0.0),
+        fx.ElectronMultiplication(0.0),
+        fx.RowNoise(0.0),
+        fx.PhotoResponseNonuniformity(0.0),
+    ],
 )
 def test_one_effect_more_leaves_the_draws(more):
     plain, added = (sample_dark(KEY, 2, (64, 64), model_of(*effects)) for effects in (BASE, (*BASE, more)))

@@ -326,6 +326,15 @@ def test_the_chain_that_reads_more_is_found(cfa, sign, rng):
     assert places(hsnoise.FrameStack(counts, (0.01, 0.1), black_level=64.0, cfa=cfa)).second_chain == sign
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("time_constant", [0.5, 20.0])
+def test_the_sign_of_a_level_that_settles_is_found(sign, time_constant, rng):
+    capture = noise(rng, (5, 5), (48, 64), "mono", sigma=8.0)
+    level = sign * 6 * np.exp(-np.arange(5) / time_constant)[:, None, None]
+    counts = [np.rint(frames + level).astype(np.uint16) for frames in capture.counts]
+    assert places(hsnoise.FrameStack(counts, (0.01, 0.1), black_level=64.0, cfa="mono")).settling == sign
+
+
 @pytest.mark.parametrize("cfa", ["mono", "RGGB"])
 @pytest.mark.parametrize("axis", ["row", "column"])
 @pytest.mark.parametrize(("start", "above"), [("first", True), ("first", False), ("last", True)])

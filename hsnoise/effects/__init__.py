@@ -22,7 +22,9 @@ from hsnoise.effects.dark_current import DarkCurrent
 from hsnoise.effects.dark_current_drift import DarkCurrentDrift
 from hsnoise.effects.dark_current_nonuniformity import DarkCurrentNonuniformity
 from hsnoise.effects.dark_signal_nonuniformity import DarkSignalNonuniformity
+from hsnoise.effects.electron_multiplication import ElectronMultiplication
 from hsnoise.effects.frame_offset import FrameOffset
+from hsnoise.effects.frame_settling import FrameSettling
 from hsnoise.effects.frame_tilt import FrameTilt
 from hsnoise.effects.gain import Gain
 from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
@@ -67,6 +69,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ColumnFixedPattern,
     FrameOffset,
     FrameTilt,
+    FrameSettling,
     DarkSignalNonuniformity,
     PhotoResponseNonuniformity,
     HotPixels,
@@ -87,6 +90,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     AdcNonuniformity,
     MissingCodes,
     CosmicRays,
+    ElectronMultiplication,
     BlackClamp,
     Nonlinearity,
     MeasuredMap,
@@ -115,7 +119,9 @@ __all__ = [
     "DarkCurrentNonuniformity",
     "DarkSignalNonuniformity",
     "EFFECTS",
+    "ElectronMultiplication",
     "FrameOffset",
+    "FrameSettling",
     "FrameTilt",
     "Gain",
     "HeavyTailedReadNoise",

@@ -54,12 +54,13 @@ class Stage(enum.IntEnum):
     PHOTONS = 1  # draws the photoelectrons
     ELECTRONS = 2  # adds electrons, whole numbers
     COUPLING = 3  # mixes the electrons of neighbouring pixels or frames, e-
-    READ = 4  # adds to the signal while it is read, e-
-    READOUT = 5  # changes the signal and its read noise in the readout chain, e-
-    GAIN = 6  # multiplies; after this stage the signal is in DN
-    BLACK = 7  # adds an offset, DN
-    CONVERSION = 8  # shapes the steps of the converter, DN
-    DIGITAL = 9  # turns DN into counts, or counts into counts
+    MULTIPLICATION = 4  # multiplies electrons on their way to the output, before it adds read noise, e- at the input
+    READ = 5  # adds to the signal while it is read, e-
+    READOUT = 6  # changes the signal and its read noise in the readout chain, e-
+    GAIN = 7  # multiplies; after this stage the signal is in DN
+    BLACK = 8  # adds an offset, DN
+    CONVERSION = 9  # shapes the steps of the converter, DN
+    DIGITAL = 10  # turns DN into counts, or counts into counts
 
 
 class Capture(eqx.Module):

@@ -18,15 +18,17 @@ LEAST_ELECTRONS = 0.2  # of a signal, below which nothing that acts on it shows
 
 @dataclass(frozen=True)
 class Places:
-    """The static patterns that fit the dark frames best, whether or not they are present.
+    """The patterns of place and time that fit the dark frames best, whether or not they are present.
 
     shading: axis, start, above and length of a `BlackShading`. glow: row and column of an `AmplifierGlow`.
-    second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1.
+    second_chain: 1 if the second chain of an `OddEvenPattern` reads more, else -1. settling: 1 if the first frames of
+    a `FrameSettling` read more, else -1.
     """
 
     shading: tuple[str, str, bool, float]
     glow: tuple[float, float]
     second_chain: int
+    settling: int
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class CaptureFacts:
         levels: numbers of signal levels: exposures of the darks, and flats.
         light_e: mean photoelectrons of a pixel in the brightest flat; 0 without flats.
         line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
-        places: where static patterns lie.
+        places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
     """
 

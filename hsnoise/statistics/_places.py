@@ -1,4 +1,4 @@
-"""Place and sign of static patterns in the frame; most other statistics have no sign."""
+"""Place and sign of patterns in the frame, and of a drift over frames; most other statistics have no sign."""
 
 from __future__ import annotations
 
@@ -22,21 +22,27 @@ def places(stack: FrameStack) -> Places:
     """The places of patterns in the dark frames of a stack."""
     step, width = len(cfa_tile(stack.cfa)), 1 if stack.cfa == "mono" else 2
     lines: dict[str, list[np.ndarray]] = {"row": [], "column": []}
-    contrast, maps = 0.0, []
+    contrast, fall, maps = 0.0, 0.0, []
     darks = sorted((i for i, kind in enumerate(stack.kind) if kind == "dark"), key=lambda i: stack.exposure_s[i])
     for i in darks:
-        total = np.zeros(stack.shape)
+        total, level = np.zeros(stack.shape), []
         for frame in stack.frames(i):
             total += frame
+            level.append(frame.mean(dtype=np.float64))
             for axis, along in (("row", 1), ("column", 0)):
                 lines[axis].append(_colours_together(frame.mean(along, dtype=np.float64), step))
         maps.append(total / stack.n_frames[i])
+        half = len(level) // 2
+        fall += np.sum(level[:half]) - np.sum(level[len(level) - half :])
         column = maps[-1].mean(0)
         chain = np.arange(len(column)) // width % 2
         contrast += column[chain == 1].mean() - column[chain == 0].mean()
     longest = maps[-1] - maps[0] if stack.exposure_s[darks[-1]] > stack.exposure_s[darks[0]] else maps[-1]
     return Places(
-        _shading({axis: np.stack(some) for axis, some in lines.items()}), _glow(longest), 1 if contrast > 0 else -1
+        _shading({axis: np.stack(some) for axis, some in lines.items()}),
+        _glow(longest),
+        1 if contrast > 0 else -1,
+        1 if fall > 0 else -1,
     )
 
 

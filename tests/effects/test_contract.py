@@ -31,7 +31,9 @@ from hsnoise.effects import (
     DarkCurrentDrift,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
+    ElectronMultiplication,
     FrameOffset,
+    FrameSettling,
     FrameTilt,
     Gain,
     HeavyTailedReadNoise,
@@ -84,6 +86,7 @@ EXAMPLES = [
     ColumnFixedPattern(2.0),
     FrameOffset(1.0),
     FrameTilt(2.0),
+    FrameSettling(-3.0, 2.0),
     DarkSignalNonuniformity(2.0),
     PhotoResponseNonuniformity(0.1),
     HotPixels(0.2, 500.0),
@@ -104,6 +107,7 @@ EXAMPLES = [
     AdcNonuniformity(0.4, 8),
     MissingCodes(2.6),
     CosmicRays(5e6, 300.0),
+    ElectronMultiplication(0.9, 0.5),
     BlackClamp([70.0, 60.0, 65.0]),
     Nonlinearity(1e-3),
     MeasuredMap(
@@ -125,6 +129,7 @@ DETERMINISTIC = (
     | ImageLag
     | OddEvenPattern
     | BlackShading
+    | FrameSettling
     | MissingCodes
     | BlackClamp
     | Nonlinearity

@@ -13,6 +13,7 @@ from hsnoise.effects import (
     ColumnNoise,
     DarkSignalNonuniformity,
     FrameOffset,
+    FrameSettling,
     FrameTilt,
     PeriodicBanding,
     RowBankNoise,
@@ -139,6 +140,14 @@ def test_tilt_is_a_line_of_new_slope(axis):
 
 def test_a_single_line_is_not_tilted():
     np.testing.assert_array_equal(darks(FrameTilt(2.0), 3, (1, 4), cfa="mono"), 0)
+
+
+@pytest.mark.parametrize(("amplitude", "frames"), [(3.0, 2.5), (-3.0, 0.4)])
+def test_a_level_settles_alike_in_every_run(amplitude, frames):
+    drawn = darks(FrameSettling(amplitude, frames), 8, (4, 6))
+    expected = amplitude * np.exp(-np.arange(8) / frames)
+    np.testing.assert_allclose(drawn, np.broadcast_to(expected[:, None, None], drawn.shape), rtol=1e-6)
+    np.testing.assert_array_equal(darks(FrameSettling(amplitude, frames), 5, (4, 6), exposure_s=1.0), drawn[:5])
 
 
 @pytest.mark.parametrize("length", [0.1, 0.6, 1e4])

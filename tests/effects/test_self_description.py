@@ -55,7 +55,7 @@ RICH = CaptureFacts(
     levels=5,
     light_e=150.0,
     line=("row", 0.13),
-    places=Places(("column", "last", True, 0.3), (1.0, 0.5), -1),
+    places=Places(("column", "last", True, 0.3), (1.0, 0.5), -1, 1),
     code_step=None,
 )
 POOR = dataclasses.replace(
@@ -162,7 +162,7 @@ def test_what_is_proposed_is_the_effect(effect):
 def test_a_poor_capture_is_offered_little():
     offered = built_in(POOR)
     several_frames = {effect.name for effect in PROPOSED if effect.least_frames > 1}
-    assert several_frames == {"image_lag", "dark_current_drift", "frame_offset", "black_shading"}
+    assert several_frames == {"image_lag", "dark_current_drift", "frame_offset", "frame_settling", "black_shading"}
     assert not several_frames & set(offered)
     assert not {"amplifier_glow", "dark_current_nonuniformity", "black_clamp", "nonlinearity"} & set(offered)
     assert {"row_noise", "hot_pixels", "cosmic_rays"} <= set(offered)
