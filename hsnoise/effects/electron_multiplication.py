@@ -13,6 +13,8 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
+MOST_READ_NOISE_E = 2.5  # beyond which the tail of single electrons does not show; registers are there to be far below
+
 
 class ElectronMultiplication(AbstractEffect):
     """n electrons that a gain register multiplies by M read (1 - e) n + Gamma(e n), with the excess e = 1 - 1/M.
@@ -64,7 +66,10 @@ class ElectronMultiplication(AbstractEffect):
         return entering - jnp.where(some, shape - drawn, 0)
 
     @classmethod
-    def propose(cls, facts: CaptureFacts) -> Maker:
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if facts.read_noise_e > MOST_READ_NOISE_E:
+            return None
+
         def make(size: float, rng: np.random.Generator) -> ElectronMultiplication:
             # Registers work near the limit, but the gain of a fit without one has absorbed most of the excess.
             return cls(min(size, 1.0), rng.uniform(0, 0.1 * size))

@@ -44,7 +44,7 @@ RICH = CaptureFacts(
     effects=tuple(name for name in NOT_PROPOSED if name not in MEASURED),
     cfa="RGGB",
     shutter="rolling",
-    read_noise_e=3.5,
+    read_noise_e=2.4,
     dark_e_per_s=118.0,
     gain=np.array([3.5, 3.1, 4.0]),
     frames=8,
@@ -169,6 +169,7 @@ def test_a_poor_capture_is_offered_little():
     hot, rays = (made(offered[name], 1.0, 0) for name in ("hot_pixels", "cosmic_rays"))
     assert hot.rate == rays.rate == 0 and hot.at_readout > 0 and rays.at_readout > 0
     assert set(built_in(RICH)) == {effect.name for effect in PROPOSED}
+    assert "electron_multiplication" not in built_in(dataclasses.replace(RICH, read_noise_e=3.5))
     assert "row_noise" not in built_in(dataclasses.replace(RICH, effects=("row_noise",)))
     assert "shared_row_gain" not in built_in(dataclasses.replace(RICH, cfa="mono"))
 
