@@ -73,6 +73,38 @@ def exponent_of(correlation: float, n: int, lag: int = 1) -> float:
     return float(scipy.optimize.brentq(off, low, high, xtol=1e-4))
 
 
+def banks_of(next_row: float, next_but_one: float, n: int) -> tuple[float, float]:
+    """Exponent, and the part of the variance that both banks share, of two banks with these correlations [n rows].
+
+    Series as `power_of_banks` and `fading_power` have them, less their means. Both within their bounds: an exponent
+    from 0 to EXPONENTS, a part from 0 to 1.
+    """
+    at = np.exp(2j * np.pi * np.outer([0, 1, 2], np.arange(n)) / n).real
+
+    def covariances(exponent: float) -> tuple[np.ndarray, np.ndarray]:
+        with jax.enable_x64(True):
+            own, common = (np.array(of(n, jnp.float64(exponent))) for of in (power_of_banks, fading_power))
+        own[0] = common[0] = 0.0
+        return at @ own, at @ common
+
+    def shared(exponent: float) -> float:
+        own, common = covariances(exponent)
+        apart, alike = next_row * own[0] - own[1], common[1] - next_row * common[0]
+        return float(np.clip(apart / max(apart + alike, 1e-12), 0.0, 1.0))
+
+    def off(exponent: float) -> float:
+        own, common = covariances(exponent)
+        both = (1 - shared(exponent)) * own + shared(exponent) * common
+        return float(both[2] / both[0]) - next_but_one
+
+    low, high = 0.0, EXPONENTS[1]
+    if off(low) >= 0 or off(high) <= 0:
+        exponent = low if off(low) >= 0 else high
+    else:
+        exponent = float(scipy.optimize.brentq(off, low, high, xtol=1e-4))
+    return exponent, shared(exponent)
+
+
 def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None = None) -> jax.Array:
     """Spectrum [n] of a row gain: a power law without DC term plus a share of white noise with one (None: no share).
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hsnoise._core.coloured import EXPONENTS, exponent_of
+from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
@@ -37,8 +37,6 @@ PATTERNS = {
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
 ROW_GAIN_THERE = 3.0
-TOGETHER = 6.0  # chance deviations above which rows are not white
-LEAST_EXPONENT_ERROR = 0.01  # no spectrum is exactly a power law
 ROUNDS = 30
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 UNKNOWN = 1e6  # relative error of an unknown value
@@ -58,7 +56,7 @@ class Channel:
             error, and its chance deviation if there is none.
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
-        row_exponent: of the spectrum of what rows share, with its error; 0 if they are white.
+        row_spectrum: of what rows share in a frame.
         noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
@@ -75,7 +73,7 @@ class Channel:
     patterns: Mapping[str, tuple[float, float, float]]
     temporal_dn2: float
     shading: Mapping[str, Shading]
-    row_exponent: tuple[float, float]
+    row_spectrum: RowSpectrum
     noise_spread: tuple[float, float]
     photo_response: tuple[float, float]
     warm: Warm | None
@@ -144,32 +142,11 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         patterns=patterns,
         temporal_dn2=floor,
         shading=shading,
-        row_exponent=_row_exponent(found, c),
+        row_spectrum=row_spectrum(_shortest(found, c), found.shape[0]),
         noise_spread=read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
     )
-
-
-def _row_exponent(found: Survey, c: int) -> tuple[float, float]:
-    """Exponent of what rows share in a frame, from the covariance of neighbouring rows of a plane, and its error.
-
-    0 for white rows. The error is infinite for these, and if rows are redder or bluer than any exponent allows.
-    """
-    planes = _shortest(found, c)
-    if not planes:
-        return 0.0, np.inf
-    together = mean_of([p.rows_together for p in planes])
-    alone = mean_of([p.components["row_x_frame"] for p in planes])
-    if alone.variance_dn2 <= 0 or abs(together.variance_dn2) < TOGETHER * together.chance_dn2:
-        return 0.0, np.inf
-    step = found.shape[0] // len(planes[0].row_mean_dn)
-    correlation = together.variance_dn2 / alone.variance_dn2
-    error = np.hypot(together.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
-    low, middle, high = (exponent_of(correlation + way * error, found.shape[0], step) for way in (-1, 0, 1))
-    if middle in EXPONENTS:
-        return middle, np.inf
-    return middle, max((high - low) / 2, LEAST_EXPONENT_ERROR)
 
 
 def _warm(found: Survey, c: int) -> Warm | None:

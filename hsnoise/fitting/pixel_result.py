@@ -20,6 +20,7 @@ from hsnoise.effects import (
     HotPixels,
     PhotoResponseNonuniformity,
     ReadNoiseNonuniformity,
+    RowBankNoise,
     RowFixedPattern,
     RowNoise,
 )
@@ -48,6 +49,7 @@ OF_PIXELS = (
     RowFixedPattern,
     ColumnFixedPattern,
     RowNoise,
+    RowBankNoise,
     ColumnNoise,
     BlackShading,
 )
@@ -61,7 +63,8 @@ BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_l
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
     """The result; `model` says which effects are wanted (None: the paper's, and those of the population found)."""
     gain, read, rate = _electrons(pixel)
-    population = _population(pixel, gain, float(np.max(summary.exposure_s, initial=0.0)))
+    longest_s = float(np.max(summary.exposure_s, initial=0.0))
+    population = _with_banks(_population(pixel, gain, longest_s), pixel, model)
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
     black, row = _black(pixel, summary), _rows(pixel)
@@ -137,7 +140,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
-    exponents = [c.row_exponent for c in pixel.channels]
+    exponents = [c.row_spectrum.exponent for c in pixel.channels]
     if "row_noise" in found and all(value != 0 for value, _ in exponents):
         found["row_noise"]["exponent"] = _mean(exponents)
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
@@ -158,6 +161,19 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
     return found | _hot(pixel, many)
+
+
+def _with_banks(population: dict, pixel: PixelFit, model: NoiseModel | None) -> dict:
+    """The population with row noise as that of two banks of converters, if rows say so and the model may have it."""
+    banks = [c.row_spectrum.banks for c in pixel.channels]
+    there = all(of is not None for of in banks)
+    wanted = there if model is None else "row_bank_noise" in model and "row_noise" not in model
+    if not wanted or "row_noise" not in population:
+        return population
+    of_rows = {"exponent": (0.0, np.inf), **population["row_noise"], "shared": (1.0, np.inf)}
+    if there:
+        of_rows["exponent"], of_rows["shared"] = (_mean([of[i] for of in banks if of is not None]) for i in (0, 1))
+    return {**{name: of for name, of in population.items() if name != "row_noise"}, "row_bank_noise": of_rows}
 
 
 def _hot(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:

@@ -125,15 +125,16 @@ def with_tails(
     }
 
 
-def of_neighbouring_rows(row_mean_dn: np.ndarray) -> Component:
-    """Covariance of neighbouring rows in a frame, DN^2, from row means [frame, row]; 0 for white rows."""
+def of_neighbouring_rows(row_mean_dn: np.ndarray, lag: int = 1) -> Component:
+    """Covariance of rows `lag` apart in a frame, DN^2, from row means [frame, row]; 0 for white rows."""
     n, h = row_mean_dn.shape
-    if n < 2 or h < 3:
+    if n < 2 or h < lag + 2:
         return Component(np.nan, np.nan)
     left = row_mean_dn - row_mean_dn.mean(0)
     left = left - left.mean(1, keepdims=True)
     error = float(left.var()) / np.sqrt((n - 1) * (h - 1))
-    return Component(float((left[:, 1:] * left[:, :-1]).sum() / ((n - 1) * (h - 1))), error, chance_dn2=error)
+    product = float((left[:, lag:] * left[:, :-lag]).sum())
+    return Component(product / ((n - 1) * (h - lag)), error, chance_dn2=error)
 
 
 def _sums_of_squares(sums: PlaneSums) -> dict[str, float]:

@@ -106,7 +106,7 @@ def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:
     if result.summary.shutter != "global" or not planes:
         return
     shared = mean_of([plane.components["row_x_frame"] for plane in planes])
-    together = mean_of([plane.rows_together for plane in planes])
+    together = mean_of([plane.rows_together[0] for plane in planes])
     if not shared.variance_dn2 > ROW_SIGMAS * shared.chance_dn2:  # NaN, too
         return
     if together.variance_dn2 > max(ROW_SIGMAS * together.chance_dn2, TOGETHER * shared.variance_dn2):

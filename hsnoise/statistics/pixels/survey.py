@@ -23,7 +23,7 @@ NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN
 class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
-    rows_together: covariance of neighbouring rows in a frame.
+    rows_together: covariance of a row with the next, and with the next but one, in a frame.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
     """
@@ -33,7 +33,7 @@ class Plane:
     column_mean_dn: np.ndarray
     frame_means_dn: np.ndarray
     components: dict[str, Component]
-    rows_together: Component
+    rows_together: tuple[Component, Component]
     halves: Halves | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
@@ -187,7 +187,7 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
         components=_components(sums, halves),
-        rows_together=of_neighbouring_rows(row_frame),
+        rows_together=(of_neighbouring_rows(row_frame), of_neighbouring_rows(row_frame, 2)),
         halves=halves,
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
