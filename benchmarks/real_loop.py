@@ -1,8 +1,8 @@
 """What `improve` makes of real sensors in a few minutes each: python -m benchmarks.real_loop
 
 Their dark frames alone, as `benchmarks.closed` takes them: what was added and the error after each addition, the
-largest part of the variance that is left, and the change of the likelihood of held-out frames. Finished sensors are
-lines of `--out`, and are not run again. Needs the captures of shared/.
+largest part of the whole variance and of a component's own that is left, and the change of the likelihood of held-out
+frames. Finished sensors are lines of `--out`, and are not run again. Needs the captures of shared/.
 
     python -m benchmarks.real_loop --minutes 5 --only STL IMX
 """
@@ -25,7 +25,14 @@ from benchmarks.closed import SENSORS
 from hsnoise._core.sheet import Sheet
 from hsnoise.fitting.result import number
 
-HEADINGS = ("capture", "error after each addition", "largest share left", "held out, nats", "time")
+HEADINGS = (
+    "capture",
+    "error after each addition",
+    "left of the whole",
+    "left of a component",
+    "held out, nats",
+    "time",
+)
 
 
 def improved(name: str, place: Callable[[Path, Path], None], minutes: float) -> tuple[str, ...]:
@@ -37,12 +44,16 @@ def improved(name: str, place: Callable[[Path, Path], None], minutes: float) -> 
         try:
             story = hsnoise.improve(hsnoise.load(folder, progress=False), max_minutes=minutes)
         except (ValueError, RuntimeError) as error:
-            return name, f"refused: {error}", "", "", _minutes(began)
+            return name, f"refused: {error}", "", "", "", _minutes(began)
     steps = [f"{step.added or ''} {number(step.comparison.error)}".strip() for step in story.steps]
-    worst = story.steps[-1].comparison.largest_unexplained
+    last = story.steps[-1].comparison
+    worst, by_itself = last.largest_unexplained, max(last.shares, key=lambda one: one.unexplained, default=None)
     left = "none" if worst is None else f"{worst.component}, {100 * worst.unexplained_of_total:.2g} %"
+    alone = (
+        "none" if worst is None or by_itself is None else f"{by_itself.component}, {100 * by_itself.unexplained:.2g} %"
+    )
     held_out = f"{story.steps[0].held_out:.0f} to {story.steps[-1].held_out:.0f}"
-    return name, "; ".join(steps), left, held_out, _minutes(began)
+    return name, "; ".join(steps), left, alone, held_out, _minutes(began)
 
 
 def _minutes(began: float) -> str:
