@@ -15,6 +15,7 @@ from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Simulator
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
+NEARBY_ERROR = 0.02  # of a shift drawn with parameters brought close to the capture
 SLOPE_DRAWS = 2
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many such steps it may be off
 FAR_REACH = 30.0  # likewise, of the row gain: another kind of row noise can pass for a row gain where there is none
@@ -23,16 +24,20 @@ BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gai
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Shifts of the statistics [amplitude, detail, statistic] in units of the base draws' deviation."""
+    """Shifts of the statistics [amplitude, detail, statistic] in units of the base draws' deviation.
+
+    error: of a shift, relative.
+    """
 
     name: str
     maker: Maker
     amplitudes: tuple[float, ...]
     shifts: np.ndarray
+    error: float = RELATIVE_ERROR
 
     def distribution(self, amplitude: float, null: Gaussian) -> Gaussian:
         """Distribution of the statistics with the effect at `amplitude` in the sensor."""
-        return distribution_of(self.at(amplitude), null)
+        return distribution_of(self.at(amplitude), null, self.error)
 
     def at(self, amplitude: float) -> np.ndarray:
         """Shifts [detail, statistic], interpolated between the amplitudes that were drawn, linear from 0."""
@@ -43,14 +48,16 @@ class Fingerprint:
         return values[i - 1] + share * (values[i] - values[i - 1])
 
 
-def distribution_of(shifts: np.ndarray, null: Gaussian, of_details: bool = True) -> Gaussian:
+def distribution_of(
+    shifts: np.ndarray, null: Gaussian, error: float = RELATIVE_ERROR, *, of_details: bool = True
+) -> Gaussian:
     """Distribution of the statistics where an effect shifts them by one of `shifts` [detail, statistic].
 
-    of_details: whether the scatter over details is included.
+    error: of a shift, relative; of_details: whether the scatter over details is included.
     """
     mean = shifts.mean(0)
     covariance = null.covariance.copy()
-    covariance[np.diag_indices_from(covariance)] += (RELATIVE_ERROR * mean) ** 2
+    covariance[np.diag_indices_from(covariance)] += (error * mean) ** 2
     if of_details:
         spread = (shifts - mean) / np.sqrt(max(len(shifts) - 1, 1))
         covariance += spread.T @ spread

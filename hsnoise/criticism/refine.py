@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.criticism.fingerprint import BASE, RELATIVE_ERROR, Bench, distribution_of
+from hsnoise.criticism.fingerprint import BASE, NEARBY_ERROR, RELATIVE_ERROR, Bench, distribution_of
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
 from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of
@@ -21,7 +21,6 @@ SHORT_STEP = 0.05  # of an unconstrained number: where a search ends
 DRAWS, SLOPE_DRAWS, PAIR_DRAWS, NEARBY_DRAWS = 6, 2, 12, 16
 STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
-NEARBY_ERROR = 0.02  # of shifts close to the capture
 TINY = 1e-3  # a parameter of the base that is zero
 
 

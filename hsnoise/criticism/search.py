@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import given
-from hsnoise.criticism.fingerprint import Bench
+from hsnoise.criticism.fingerprint import NEARBY_ERROR, Bench
 from hsnoise.criticism.outcomes import Side, has_sides, on_side
 from hsnoise.criticism.ranking import (
     CLOSE,
@@ -102,7 +102,7 @@ class Search:
         """An effect with parameters brought closer to the capture, judged by many draws there."""
         maker = given(*refined([effect], self.bench, self.evidence))
         (of,) = self.bench.fingerprints({effect.name: (maker, AROUND)}, CLOSE_DETAILS)
-        return judge(of, self.evidence, CLOSE)
+        return judge(replace(of, error=NEARBY_ERROR), self.evidence, CLOSE)
 
     def with_its_base(self, judged: list[Judged]) -> tuple[list[Judged], WithBase | None]:
         """The first candidate with the base fitted to it: on its side of the gain, where it has sides.
