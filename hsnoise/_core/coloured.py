@@ -76,8 +76,8 @@ def exponent_of(correlation: float, n: int, lag: int = 1) -> float:
 def banks_of(next_row: float, next_but_one: float, n: int) -> tuple[float, float]:
     """Exponent, and the part of the variance that both banks share, of two banks with these correlations [n rows].
 
-    Series as `power_of_banks` and `fading_power` have them, less their means. Both within their bounds: an exponent
-    from 0 to EXPONENTS, a part from 0 to 1.
+    Series as `power_of_banks` and `fading_power` have them, less their means. The exponent is from 0 to EXPONENTS; the
+    part may lie beyond 0 and 1, as correlations do by chance.
     """
     at = np.exp(2j * np.pi * np.outer([0, 1, 2], np.arange(n)) / n).real
 
@@ -90,11 +90,12 @@ def banks_of(next_row: float, next_but_one: float, n: int) -> tuple[float, float
     def shared(exponent: float) -> float:
         own, common = covariances(exponent)
         apart, alike = next_row * own[0] - own[1], common[1] - next_row * common[0]
-        return float(np.clip(apart / max(apart + alike, 1e-12), 0.0, 1.0))
+        return float(apart / max(apart + alike, 1e-12))
 
     def off(exponent: float) -> float:
         own, common = covariances(exponent)
-        both = (1 - shared(exponent)) * own + shared(exponent) * common
+        part = np.clip(shared(exponent), 0.0, 1.0)
+        both = (1 - part) * own + part * common
         return float(both[2] / both[0]) - next_but_one
 
     low, high = 0.0, EXPONENTS[1]

@@ -164,7 +164,7 @@ def _compare(args: argparse.Namespace) -> None:
         capture = same_capture(args)
         last = [
             f"What is missing: hsnoise diagnose {capture} --model {shlex.quote(args.model)}",
-            f"To add it: hsnoise improve {capture}",
+            f"To add it: hsnoise improve {capture} --model {shlex.quote(args.model)}",
         ]
     _show(args, found, page_of_comparison(found), "comparison.png", stack, fit=model, last=last)
 
@@ -246,6 +246,7 @@ def _show(
 def _same_story(args: argparse.Namespace, story: Story) -> str:
     """The options with which a story goes on, beside those of its capture."""
     given = {"--out": args.out, "--model": args.model, "--seed": args.seed or None}
+    given["--max-minutes"] = args.max_minutes
     given["--max-steps"] = story.ending.limit + MOST_STEPS if story.ending.why == Ended.STEPS else None
     return "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
 

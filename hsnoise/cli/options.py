@@ -155,7 +155,8 @@ def _limit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on where an earlier run with this --out ended or was stopped, with the same frames, model and seed",
+        help="go on where an earlier run with this --out ended or was stopped, with the same frames, model and seed; "
+        "start from the beginning if there is none",
     )
     parser.add_argument(
         "--close",

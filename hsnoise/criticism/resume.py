@@ -6,6 +6,7 @@ draws is read.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise._core.output import write_atomically
 from hsnoise.criticism.records import Records
 from hsnoise.criticism.story import Step, Story
@@ -50,7 +52,7 @@ def write_story(path: str | os.PathLike, story: Story) -> None:
             for step in story.steps
         ],
     }
-    write_atomically(path, (json.dumps(content) + "\n").encode())
+    write_atomically(path, (json.dumps({**content, "sha256": _hash(content)}) + "\n").encode())
 
 
 def read_steps(
@@ -73,17 +75,24 @@ def read_steps(
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT or content["format_version"] != FORMAT_VERSION:
             raise ValueError("its format is another")
+        if content.pop("sha256") != _hash(content):
+            raise ValueError("it was changed")
         of = {name: content[name] for name in ("cfa", "shutter", "exposure_s")}
         records = Records({one.name: one for one in (*EFFECTS, *own)}, NoiseModel((), **of))
         steps = [{name: records.from_json(step[name]) for name in OF_STEP} for step in content["steps"]]
         fits = [{name: records.from_json(step["fit"][name]) for name in OF_FIT} for step in content["steps"]]
         if not fits:
             raise ValueError("it has no steps")
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a story that improve saved, as this version writes it ({error})") from error
+    except (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+        expected = "expected a story that improve saved, as this version writes it"
+        raise ValueError(f"{path}: {expected} ({error!s:.80}); begin anew without {named('resume')}") from error
     if content["seed"] != seed:
         raise ValueError(f"seed: expected {content['seed']}, with which {path} was begun, got {seed}")
     return _with_frames(path, steps, fits, refit, given)
+
+
+def _hash(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def _with_frames(path: Path, steps, fits, refit: Refit, given: NoiseModel | None) -> list[Step]:
@@ -103,6 +112,6 @@ def _check_same(path: Path, base: FitResult, stored: Any) -> None:
     before = stored.table if isinstance(stored, NoiseModel) else {}
     if again.keys() != before.keys() or not all(np.isclose(again[name][0], before[name][0], SAME) for name in before):
         raise ValueError(
-            f"resume: expected the frames and the model with which {path} was begun, and the same version of hsnoise:"
-            " the first fit comes out differently"
+            f"{named('resume')}: the first fit comes out differently from that of {path}, which was begun with other"
+            " frames, another model or another version of hsnoise; give those, or begin anew in another folder"
         )

@@ -14,6 +14,7 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
+MOST_CODES = 1 << 16  # of a converter
 NARROWEST_DN = 1.2  # of noise over whose codes a pattern shows
 
 
@@ -30,7 +31,7 @@ class AdcNonuniformity(AbstractEffect):
     captures of few codes nothing.
 
     Attributes:
-        period: codes after which the pattern repeats, at least 2.
+        period: codes after which the pattern repeats, 2 to MOST_CODES.
 
     References: IEEE Std 1241-2010 (differential nonlinearity; its test by histogram); Doernberg, Lee, and Hodges,
     "Full-speed testing of A/D converters", IEEE J. Solid-State Circuits 19, 1984.
@@ -42,8 +43,10 @@ class AdcNonuniformity(AbstractEffect):
     period: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        if not isinstance(self.period, int) or isinstance(self.period, bool) or self.period < 2:
-            raise ValueError(f"adc_nonuniformity.period: expected a whole number of at least 2, got {self.period!r}.")
+        whole = isinstance(self.period, int) and not isinstance(self.period, bool)
+        if not whole or not 2 <= self.period <= MOST_CODES:
+            expected = f"expected a whole number from 2 to {MOST_CODES}"
+            raise ValueError(f"adc_nonuniformity.period: {expected}, got {self.period!r:.40}.")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         ends = jnp.cumsum(self._widths(capture, signal.dtype))

@@ -141,8 +141,11 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
     exponents = [c.row_spectrum.exponent for c in pixel.channels]
-    if "row_noise" in found and all(value != 0 for value, _ in exponents):
-        found["row_noise"]["exponent"] = _mean(exponents)
+    if "row_noise" in found:
+        sigma, error = found["row_noise"]["sigma"]
+        found["row_noise"]["sigma"] = sigma, error * max(c.row_spectrum.widened for c in pixel.channels)
+        if all(value != 0 for value, _ in exponents):
+            found["row_noise"]["exponent"] = _mean(exponents)
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of
+from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of, fading_power, power_of_banks
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.survey import Plane
 
-TOGETHER = 6.0  # chance deviations above which rows are not white, or resemble the next but one more than the next
+TOGETHER = 6.0  # chance deviations above which rows are not white
+COMBED = 4.0  # above which a row resembles the next but one more than the next: in one series of rows it is less
 LEAST_ERROR = 0.01  # of an exponent or a share: no spectrum is exactly a power law
-STEP = 1e-3  # of a correlation, for derivatives
 
 Number = tuple[float, float]
 
@@ -23,14 +23,16 @@ class RowSpectrum(NamedTuple):
 
     exponent: of one series over all rows; 0 if they are white. The error is infinite then, and if rows are redder or
     bluer than any exponent allows. banks: exponent and shared part of the variance if two banks convert even and odd
-    rows; else None. It shows in mono sensors, whose planes have all rows.
+    rows; else None. It shows in mono sensors, whose planes have all rows. widened: factor on the error of the variance
+    of the rows that holds for independent rows: where they resemble each other, there are fewer.
     """
 
     exponent: Number
     banks: tuple[Number, Number] | None
+    widened: float
 
 
-WHITE = RowSpectrum((0.0, np.inf), None)
+WHITE = RowSpectrum((0.0, np.inf), None, 1.0)
 
 
 def row_spectrum(planes: Sequence[Plane], rows: int) -> RowSpectrum:
@@ -44,17 +46,28 @@ def row_spectrum(planes: Sequence[Plane], rows: int) -> RowSpectrum:
     combed = (but_one.variance_dn2 - near.variance_dn2) / np.hypot(but_one.chance_dn2, near.chance_dn2)
     step = rows // len(planes[0].row_mean_dn)
     banks = None
-    if step == 1 and combed > TOGETHER and near.variance_dn2 > -TOGETHER * near.chance_dn2:
+    if step == 1 and combed > COMBED and near.variance_dn2 > -TOGETHER * near.chance_dn2:
         of = np.array([near.variance_dn2, but_one.variance_dn2]) / alone.variance_dn2
         errors = np.array([near.standard_error_dn2, but_one.standard_error_dn2]) / alone.variance_dn2
         banks = _banks(of, np.hypot(errors, of * alone.standard_error_dn2 / alone.variance_dn2), rows)
     if abs(near.variance_dn2) < TOGETHER * near.chance_dn2:
-        return RowSpectrum(WHITE.exponent, banks)
+        return WHITE._replace(banks=banks, widened=_widened(WHITE.exponent, banks, rows))
     correlation = near.variance_dn2 / alone.variance_dn2
     error = np.hypot(near.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
     low, middle, high = (exponent_of(correlation + way * error, rows, step) for way in (-1, 0, 1))
     exponent = (middle, np.inf) if middle in EXPONENTS else (middle, max((high - low) / 2, LEAST_ERROR))
-    return RowSpectrum(exponent, banks)
+    return RowSpectrum(exponent, banks, _widened(exponent, banks, rows))
+
+
+def _widened(exponent: Number, banks: tuple[Number, Number] | None, rows: int) -> float:
+    """Root of the sum of squared correlations at all lags (Bartlett's formula for a variance)."""
+    power = np.array(fading_power(rows, np.float32(exponent[0])), float)
+    if banks is not None:
+        (red, _), (shared, _) = banks
+        own, common = (np.array(of(rows, np.float32(red)), float) for of in (power_of_banks, fading_power))
+        power = (1 - shared) * own + shared * common
+    power[0] = 0.0  # the mean of the rows is the frame's
+    return float(np.sqrt(np.mean(power**2)) / np.mean(power))
 
 
 def _banks(correlations: np.ndarray, errors: np.ndarray, rows: int) -> tuple[Number, Number]:
@@ -64,6 +77,10 @@ def _banks(correlations: np.ndarray, errors: np.ndarray, rows: int) -> tuple[Num
         return np.array(banks_of(float(of[0]), float(of[1]), rows))
 
     found = numbers(correlations)
-    slopes = np.stack([numbers(correlations + step) - found for step in STEP * np.eye(2)]) / STEP
-    error = np.maximum(np.sqrt(((slopes * errors[:, None]) ** 2).sum(0)), LEAST_ERROR)
-    return (float(found[0]), float(error[0])), (float(found[1]), float(error[1]))
+    at = (float(found[0]), 0.0), (float(np.clip(found[1], 0, 1)), 0.0)
+    wide = errors * _widened(WHITE.exponent, at, rows)
+    # Whole errors, up and down: at a bound of the exponent, derivatives of one side are zero.
+    steps = np.stack([wide, -wide])[..., None] * np.eye(2)
+    apart = np.abs([[numbers(correlations + step) - found for step in of] for of in steps]).max(0)
+    error = np.maximum(np.sqrt((apart**2).sum(0)), LEAST_ERROR)
+    return (at[0][0], float(error[0])), (at[1][0], float(error[1]))
