@@ -261,3 +261,4 @@ def test_a_story_that_was_stopped_says_how_to_go_on(ending, options, printed, fo
     monkeypatch.setitem(found, "improve", replace(found["improve"], ending=ending))
     last_line = printed("improve").splitlines()[-1]
     assert last_line.startswith("To go on: hsnoise improve ") and last_line.endswith(f"/improve{options} --resume")
+    assert printed("improve", "--close").splitlines()[-1].endswith(f"/improve{options} --close --resume")

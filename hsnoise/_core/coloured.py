@@ -45,13 +45,15 @@ def _fading(exponent: Scalar) -> jax.Array:
     return jnp.maximum(1 - jnp.abs(exponent), 0.0) ** 2
 
 
-def power_of_banks(n: int, exponent: Scalar) -> jax.Array:
-    """Spectrum [n] of two independent series of `fading_power` that take turns.
+def power_of_banks(n: int, exponent: Scalar, shared: Scalar | float = 0.0) -> jax.Array:
+    """Spectrum [n] of two independent series of `fading_power` that take turns, and one more for a `shared` part.
 
-    Each has every second place, so frequencies fold at a quarter of a cycle per place. An odd n has no half a cycle.
+    Each bank has every second place, so frequencies fold at a quarter of a cycle per place. An odd n has no half a
+    cycle.
     """
     k = _cycles(n, exponent)
-    return _law(jnp.minimum(k, (n + 1) // 2 - k), exponent, _fading(exponent))
+    own = _law(jnp.minimum(k, (n + 1) // 2 - k), exponent, _fading(exponent))
+    return (1 - shared) * own + shared * fading_power(n, exponent)
 
 
 def exponent_of(correlation: float, n: int, lag: int = 1) -> float:
@@ -79,23 +81,22 @@ def banks_of(next_row: float, next_but_one: float, n: int) -> tuple[float, float
     Series as `power_of_banks` and `fading_power` have them, less their means. The exponent is from 0 to EXPONENTS; the
     part may lie beyond 0 and 1, as correlations do by chance.
     """
-    at = np.exp(2j * np.pi * np.outer([0, 1, 2], np.arange(n)) / n).real
+    at = np.cos(2 * np.pi * np.outer([0, 1, 2], np.arange(n)) / n)
 
-    def covariances(exponent: float) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(exponent: float, shared: float) -> np.ndarray:
+        """At lags of 0, 1 and 2 rows."""
         with jax.enable_x64(True):
-            own, common = (np.array(of(n, jnp.float64(exponent))) for of in (power_of_banks, fading_power))
-        own[0] = common[0] = 0.0
-        return at @ own, at @ common
+            power = np.array(power_of_banks(n, jnp.float64(exponent), shared))
+        power[0] = 0.0
+        return at @ power
 
     def shared(exponent: float) -> float:
-        own, common = covariances(exponent)
+        own, common = (covariances(exponent, of) for of in (0.0, 1.0))
         apart, alike = next_row * own[0] - own[1], common[1] - next_row * common[0]
         return float(apart / max(apart + alike, 1e-12))
 
     def off(exponent: float) -> float:
-        own, common = covariances(exponent)
-        part = np.clip(shared(exponent), 0.0, 1.0)
-        both = (1 - part) * own + part * common
+        both = covariances(exponent, float(np.clip(shared(exponent), 0.0, 1.0)))
         return float(both[2] / both[0]) - next_but_one
 
     low, high = 0.0, EXPONENTS[1]

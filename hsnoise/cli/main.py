@@ -245,10 +245,16 @@ def _show(
 
 def _same_story(args: argparse.Namespace, story: Story) -> str:
     """The options with which a story goes on, beside those of its capture."""
-    given = {"--out": args.out, "--model": args.model, "--seed": args.seed or None}
-    given["--max-minutes"] = args.max_minutes
-    given["--max-steps"] = story.ending.limit + MOST_STEPS if story.ending.why == Ended.STEPS else None
-    return "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
+    given = {
+        "--out": args.out,
+        "--model": args.model,
+        "--seed": args.seed or None,
+        "--report": args.report,
+        "--max-minutes": args.max_minutes,
+        "--max-steps": story.ending.limit + MOST_STEPS if story.ending.why == Ended.STEPS else None,
+    }
+    words = [word for name, value in given.items() if value is not None for word in (name, str(value))]
+    return " " + shlex.join(words + ["--close"] * args.close)
 
 
 def _tell(args: argparse.Namespace, page: Page, found, foot: Sequence[str] = (), files: Sequence[Path] = ()) -> None:

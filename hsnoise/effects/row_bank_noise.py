@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 
-from hsnoise._core.coloured import coloured_normal, fading_power, power_of_banks
+from hsnoise._core.coloured import coloured_normal, power_of_banks
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
@@ -63,5 +63,4 @@ class RowBankNoise(AbstractEffect):
 
     def _power(self, rows: int) -> jax.Array:
         """Spectrum [rows] of the series, of mean 1."""
-        own, common = power_of_banks(rows, self.exponent), fading_power(rows, self.exponent)
-        return (1 - self.shared) * own + self.shared * common
+        return power_of_banks(rows, self.exponent, self.shared)

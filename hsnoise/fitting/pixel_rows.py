@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of, fading_power, power_of_banks
-from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.survey import Plane
 
 TOGETHER = 6.0  # chance deviations above which rows are not white
@@ -50,22 +50,28 @@ def row_spectrum(planes: Sequence[Plane], rows: int) -> RowSpectrum:
         of = np.array([near.variance_dn2, but_one.variance_dn2]) / alone.variance_dn2
         errors = np.array([near.standard_error_dn2, but_one.standard_error_dn2]) / alone.variance_dn2
         banks = _banks(of, np.hypot(errors, of * alone.standard_error_dn2 / alone.variance_dn2), rows)
+    exponent = _exponent(near, alone, rows, step)
+    power = fading_power(rows, np.float32(exponent[0])) if banks is None else _power_of(banks, rows)
+    return RowSpectrum(exponent, banks, _widened(np.array(power, float)))
+
+
+def _exponent(near: Component, alone: Component, rows: int, step: int) -> Number:
+    """Of one series, from the covariance of rows `step` apart and their variance."""
     if abs(near.variance_dn2) < TOGETHER * near.chance_dn2:
-        return WHITE._replace(banks=banks, widened=_widened(WHITE.exponent, banks, rows))
+        return WHITE.exponent
     correlation = near.variance_dn2 / alone.variance_dn2
     error = np.hypot(near.standard_error_dn2, correlation * alone.standard_error_dn2) / alone.variance_dn2
     low, middle, high = (exponent_of(correlation + way * error, rows, step) for way in (-1, 0, 1))
-    exponent = (middle, np.inf) if middle in EXPONENTS else (middle, max((high - low) / 2, LEAST_ERROR))
-    return RowSpectrum(exponent, banks, _widened(exponent, banks, rows))
+    return middle, np.inf if middle in EXPONENTS else max((high - low) / 2, LEAST_ERROR)
 
 
-def _widened(exponent: Number, banks: tuple[Number, Number] | None, rows: int) -> float:
+def _power_of(banks: tuple[Number, Number], rows: int) -> np.ndarray:
+    (exponent, _), (shared, _) = banks
+    return np.array(power_of_banks(rows, np.float32(exponent), shared), float)
+
+
+def _widened(power: np.ndarray) -> float:
     """Root of the sum of squared correlations at all lags (Bartlett's formula for a variance)."""
-    power = np.array(fading_power(rows, np.float32(exponent[0])), float)
-    if banks is not None:
-        (red, _), (shared, _) = banks
-        own, common = (np.array(of(rows, np.float32(red)), float) for of in (power_of_banks, fading_power))
-        power = (1 - shared) * own + shared * common
     power[0] = 0.0  # the mean of the rows is the frame's
     return float(np.sqrt(np.mean(power**2)) / np.mean(power))
 
@@ -78,7 +84,7 @@ def _banks(correlations: np.ndarray, errors: np.ndarray, rows: int) -> tuple[Num
 
     found = numbers(correlations)
     at = (float(found[0]), 0.0), (float(np.clip(found[1], 0, 1)), 0.0)
-    wide = errors * _widened(WHITE.exponent, at, rows)
+    wide = errors * _widened(_power_of(at, rows))
     # Whole errors, up and down: at a bound of the exponent, derivatives of one side are zero.
     steps = np.stack([wide, -wide])[..., None] * np.eye(2)
     apart = np.abs([[numbers(correlations + step) - found for step in of] for of in steps]).max(0)
