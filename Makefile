@@ -18,10 +18,11 @@ ARGS ?=
 demo: $(VENV)/.installed
 	$(BIN)/hsnoise demo $(if $(DATA),--data "$(DATA)") $(ARGS)
 
-# Most of the time is compilation, the less of it without fusion emitters; `make test-slow` compiles as users do.
+# Most of the time is compilation: less of it without fusion emitters, and if one process runs all tests of a file.
+# `make test-slow` compiles as users do.
 test: export XLA_FLAGS ?= --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not gpu and not browser and not benchmark" $(ARGS)

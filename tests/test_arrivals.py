@@ -100,6 +100,7 @@ def test_slopes_in_single_precision_are_those_in_double(mean):
     assert all(np.isfinite(v).all() for v in single)
 
 
+@pytest.mark.slow
 def test_without_read_noise_there_is_no_derivative_and_no_nan():
     by_mean, by_sigma = slopes(jnp.array([0.0, 3.0]), jnp.array([0.0, 2.0]), jnp.asarray(0.0))
     assert not np.any(by_mean) and not np.any(by_sigma)
@@ -165,6 +166,7 @@ def test_gradient_through_rounding_and_clipping(name):
     assert abs(found - closed) < 4 * error + 2e-3 * abs(closed)
 
 
+@pytest.mark.slow
 def test_row_gain_and_added_effects_have_gradients():
     def spread(sigmas, key):
         model = hsnoise.cameras.grasshopper3().with_value("row_gain", "sigma", sigmas[0] * jnp.ones(3))

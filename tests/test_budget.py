@@ -185,6 +185,7 @@ def test_pixels_differ_by_what_they_were_drawn_with():
     assert dark.spread == pytest.approx(2 * 40 * np.sqrt(np.expm1(0.25)), rel=0.06)
 
 
+@pytest.mark.slow
 def test_the_tail_over_pixels_is_no_noise_of_estimation():
     alike = hsnoise.budget(drawn(sensor(0.0, 0.0)))
     for what in ("offset", "temporal noise"):

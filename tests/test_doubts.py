@@ -122,7 +122,9 @@ def test_a_gain_that_nothing_tells_is_withheld_by_the_likelihood_too(rng):
     assert "Read noise is 6." in fit.doubts[0]
 
 
-@pytest.mark.parametrize(("exposure_s", "light"), [(0.002, Light.RED), (1.0, Light.AMBER)])
+@pytest.mark.parametrize(
+    ("exposure_s", "light"), [(0.002, Light.RED), pytest.param(1.0, Light.AMBER, marks=pytest.mark.slow)]
+)
 def test_a_gain_from_one_exposure_is_doubted(exposure_s, light, rng):
     """Rows of a CCD that have an offset look like rows of another gain; a dark current of 1e5 e-/s is none."""
     noise = 3.0 * rng.standard_normal((2, 240, 320)) + 0.5 * rng.standard_normal((2, 240, 1))

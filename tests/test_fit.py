@@ -82,6 +82,7 @@ def test_fitted_model_samples_and_survives_its_file(canon_fit, tmp_path):
     assert frames.shape == (3, 8, 8) and frames.dtype == np.uint32  # no white level is known
 
 
+@pytest.mark.slow
 def test_expected_histograms_match_the_measured_ones(canon_fit):
     _, result = canon_fit
     for h, expected in zip(result.summary.histograms, result.expected_histograms(), strict=True):
@@ -263,6 +264,7 @@ def not_converged(coordinates, summary):
     return end._replace(converged=False, outcome="stopped by the test")
 
 
+@pytest.mark.slow
 def test_auto_falls_back_to_the_line_loudly_and_ml_refuses(canon_fit, monkeypatch):
     summary = canon_fit[1].summary
     monkeypatch.setattr(importlib.import_module("hsnoise.fit"), "maximise", not_converged)
@@ -273,6 +275,7 @@ def test_auto_falls_back_to_the_line_loudly_and_ml_refuses(canon_fit, monkeypatc
         hsnoise.fit(summary, method="ml")
 
 
+@pytest.mark.slow
 def test_line_method_and_likelihood_agree(canon_fit):
     model, result = canon_fit
     line = hsnoise.fit(result.summary, method="line")

@@ -119,6 +119,7 @@ def test_flats_of_another_crop_join_the_fit_of_the_darks(rng):
         assert abs(value - truth) < 4.5 * error and error < 0.03 * truth
 
 
+@pytest.mark.slow
 def test_a_bent_response_leaves_gain_and_read_noise_of_the_fit_alone(rng):
     sensor = Sensor(rng, short=0.02)
     flats = [sensor.frames(FULL_E * share, 8) for share in (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9)]

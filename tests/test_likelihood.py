@@ -159,7 +159,8 @@ def test_jit_vmap_and_a_float32_session_give_the_same():
     assert all(np.isfinite(np.asarray(g)).all() for g in jax.tree.leaves(gradient))
 
 
-@pytest.mark.parametrize("row_gain", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("row_gain", [True, False])
 def test_bins_that_no_row_uses_make_no_difference(row_gain, monkeypatch):
     """Left out by `plan_rules`, or put in again by `replan`; hot pixels are far out, in the last, open bin, too."""
     model = camera(shutter="global", black_level_dn=40.0)
@@ -194,14 +195,10 @@ def test_rules_hold_away_from_where_they_were_made():
         np.testing.assert_allclose(float(ours), float(own), rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "gain"),
-    [
-        pytest.param(1.7, 1.0, marks=pytest.mark.slow),
-        pytest.param(0.5, 1.0, marks=pytest.mark.slow),
-        pytest.param(1.0, 0.65, marks=pytest.mark.slow),
-        (1.3, 1.3),
-    ],
+    [(1.7, 1.0), (0.5, 1.0), (1.0, 0.65), (1.3, 1.3)],
 )
 def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, gain):
     """Coloured rows have no common offset that could take up a wrong mean."""
@@ -219,7 +216,7 @@ def test_likelihood_is_a_number_where_rows_of_a_model_have_another_mean(rate, ga
         pytest.param(1e-5, "global", 1e-7, marks=pytest.mark.slow),
         pytest.param(1e-5, "rolling", 1e-7, marks=pytest.mark.slow),
         (0.0, "global", 1e-7),
-        (0.0, "rolling", 1e-6),
+        pytest.param(0.0, "rolling", 1e-6, marks=pytest.mark.slow),
     ],
 )
 def test_rows_of_a_model_without_row_gain_need_no_integral(sigma, shutter, rtol):

@@ -101,6 +101,7 @@ def test_tables_return_what_was_clipped(canon_tables):
     assert np.abs(np.asarray(true.variance_dn2) / variance - 1).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_tables_at_the_white_level():
     gain, white = 2.0, 255.0
     mean = np.linspace(2, 240, 40)
@@ -121,6 +122,7 @@ def test_far_above_clipping_the_tables_are_the_identity_but_for_rounding():
     np.testing.assert_allclose(true.variance_dn2, variance - 1 / 12, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_pairs_that_no_law_has_are_masked_and_come_back_or_are_continued(canon_tables):
     # A normal around black clips to a mean of 0.683 clipped standard deviations; shot noise has variance gain * mean.
     ratio = stats.norm.pdf(0) / np.sqrt(0.5 - stats.norm.pdf(0) ** 2)
@@ -145,6 +147,7 @@ def test_correction_is_monotone(canon_tables):
         assert (steps[np.isfinite(steps)] > 0).all()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_right(canon_tables):
     mean, variance = np.array([2.2, 3.5, 10.0, 60.0, 0.1]), np.array([9.0, 16.0, 30.0, 120.0, 1e6])
 

@@ -151,6 +151,7 @@ def test_dark_frames_are_samples_of_no_light():
     )
 
 
+@pytest.mark.slow
 def test_parameters_and_exposure_may_be_traced():
     clean = np.full((1, 8, 6), 9.0)
     model = canon_5d3(black_level_dn=64)

@@ -184,13 +184,14 @@ class TestRealSensors:
         assert np.isnan(fit.table["gain"][0]) and np.isnan(fit.table["read_noise.sigma"][0])
         assert "Read noise is 0.82" in fit.doubts[0]
 
+    @pytest.mark.slow
     def test_st8_darks_and_flats(self, shared_data):
         fit = hsnoise.fit(hsnoise.load(shared_data / "data" / "sbig_st8_cc0", progress=False))
         assert 1 / fit.table["gain"][0] == pytest.approx(2.69, rel=0.01)
         assert fit.trustworthy
 
 
-@pytest.mark.parametrize("fall_dn", [0.0, 3.0])
+@pytest.mark.parametrize("fall_dn", [pytest.param(0.0, marks=pytest.mark.slow), 3.0])
 def test_hot_pixels_are_measured_from_the_ordinary_ones_when_the_pedestal_falls(fall_dn, rng):
     """The pedestal of a real CCD was 2 DN lower at 25 s: 690 e-/s instead of 3.3 came out for its hot pixels."""
     gain, fraction, rate, exposure_s = 0.4, 0.004, 5.0, (3.0, 25.0)
@@ -212,7 +213,7 @@ def test_hot_pixels_are_measured_from_the_ordinary_ones_when_the_pedestal_falls(
     assert abs(share - fraction) < 4 * chance
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.3])
+@pytest.mark.parametrize("spread", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_read_noise_that_differs_is_in_the_model(spread, rng):
     """From two exposures of each pixel; pixels without it get none."""
     shape, exposures = (200, 300), (0.01, 0.1, 1.0)

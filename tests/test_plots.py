@@ -66,12 +66,9 @@ def drawn(figure) -> bytes:
     return buffer.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [plots.histograms, plots.photon_transfer, plots.row_spectrum])
-@pytest.mark.parametrize(
-    "options",
-    [pytest.param({}, marks=pytest.mark.slow), {"black_level_dn": 100.0, "shutter": "global", "flats": True}],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [{}, {"black_level_dn": 100.0, "shutter": "global", "flats": True}], ids=str)
 def test_every_figure_can_be_drawn_and_names_its_axes(draw, options):
     figure = draw(fitted(**options))
     assert drawn(figure).startswith(b"\x89PNG")
@@ -80,6 +77,7 @@ def test_every_figure_can_be_drawn_and_names_its_axes(draw, options):
     assert figure.axes[0].get_ylabel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [plots.histograms, plots.photon_transfer, plots.row_spectrum])
 def test_figures_name_the_effects_that_they_lack(draw):
     fit = fitted()

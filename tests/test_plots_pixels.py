@@ -98,6 +98,7 @@ def test_every_figure_of_a_fit_can_be_drawn_and_names_its_axes(options):
         assert "without" not in figure.get_suptitle(), name
 
 
+@pytest.mark.slow
 def test_one_dark_exposure_has_no_transfer():
     fit = hsnoise.fit(captured("mono", (4.0,)), pixels="differ")
     assert set(plots.of_fit(fit)) == {"histograms", "pixel_map"}
@@ -112,6 +113,7 @@ def test_small_frames_have_figures():
     assert {"histograms", "dark_current", "pixel_map"} <= set(plots.of_fit(fit))
 
 
+@pytest.mark.slow
 def test_pixel_transfer_shows_the_line_and_the_gain_of_the_fit():
     fit = fitted()
     (_, transfer), *_ = transfers_of(fit)

@@ -76,7 +76,7 @@ def dense_log_evidence(y, variance, covariance):
     [
         pytest.param(0.1, 1.0, 0.08, 1.0, marks=pytest.mark.slow),
         pytest.param(0.1, 0.5, 0.05, 1.0, marks=pytest.mark.slow),
-        (0.05, 1.5, 0.02, 1.0),
+        pytest.param(0.05, 1.5, 0.02, 1.0, marks=pytest.mark.slow),
         (0.05, 1.0, 0.06, 0.7),
     ],
 )

@@ -108,6 +108,7 @@ def test_scatters_about_zero_with_the_information_as_covariance():
     np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / draws) + 0.15)
 
 
+@pytest.mark.slow
 def test_flats_have_a_share_in_it():
     (darks, of_darks), (both, summary) = (score_of(ALIKE, like(ALIKE, flat_e=e)) for e in (None, 400.0))
     np.testing.assert_allclose(both(summary), exact(both, summary), rtol=2e-3, atol=0.05)

@@ -387,6 +387,7 @@ def test_crosstalk_is_seen_both_ways_and_bandwidth_along_the_row_only():
         assert (z[across] > 5) == both
 
 
+@pytest.mark.slow
 def test_row_gain_of_all_colours_grows_with_signal_and_row_noise_does_not():
     names, mean, spread = clean("grasshopper3")
     low, high = (

@@ -325,6 +325,7 @@ def mono_camera(white_e=(20.0, 20.0)):
     return Camera("sensor", model, white_e)
 
 
+@pytest.mark.slow
 def test_light_is_added_to_real_dark_frames():
     camera = mono_camera()
     unseen = np.asarray(hsnoise.sample_dark(jax.random.key(0), 6, (40, 50), camera.model))

@@ -54,6 +54,7 @@ def test_parameters_come_close_to_those_hidden(hidden, start, within, like):
         assert float(getattr(found, name)) == pytest.approx(float(getattr(hidden, name)), rel=share)
 
 
+@pytest.mark.slow
 def test_settings_and_bounds_are_kept(like):
     bench, evidence = judged_by(draw_capture(8, CAMERA, like))
     typical = replace(evidence, z=np.zeros(len(evidence.names)))

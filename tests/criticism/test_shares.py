@@ -75,6 +75,7 @@ def test_single_frames_have_no_shares():
         shares_of(CAMERA, stack, jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_exposures_of_one_frame_are_left_out_of_the_budget_and_named():
     pair, single = capture(CAMERA, (0.02,)), capture(CAMERA.add(fx.RowNoise(8.0)), (0.2,), frames=2)
     counts = [np.stack(list(pair.frames(0))), np.stack(list(single.frames(0)))[:1]]

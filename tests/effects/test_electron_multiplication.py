@@ -67,6 +67,7 @@ def test_it_multiplies_all_electrons_and_no_read_noise():
     assert stats.kstest(np.ravel(drawn - electrons) / 3.0, "norm").pvalue > P_VALUE
 
 
+@pytest.mark.slow
 def test_draws_do_not_depend_on_the_batch():
     model, light = mono(ShotNoise(), ElectronMultiplication(0.99, 0.1)), np.full((6, 20, 30), 2.0)
     whole = sample(KEY, light, model)
