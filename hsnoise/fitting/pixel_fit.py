@@ -262,8 +262,7 @@ def _temporal(found: Survey, c: int) -> tuple[float, float]:
     variance = variance[~found.stuck(c)]
     if not (variance > 0).any():
         return 0.0, UNKNOWN
-    kept = without_outliers(variance, group.n_frames)
-    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
+    return without_outliers(variance, group.n_frames)
 
 
 def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -65,7 +65,7 @@ class Apart:
         column = clean.mean(1, dtype=np.float64) - frame[:, None]
         rest -= (frame[:, None, None] + row[:, :, None] + column[:, None, :]).astype(np.float32)
         rest[at] = 0
-        usual = _usual(frame)
+        usual = typical_offset(frame)
         mean = mean + np.float32(usual)
         halves = mean + np.stack([rest[half::2].mean(0) for half in (0, 1)])
         return Apart(exposure_s, mean, halves, frame - usual, row, column, rest, is_hit, hits)
@@ -109,11 +109,11 @@ class Apart:
         return (self.n_frames - 1) * (self.mean.shape[0] if axis in ("pixel", "gain") else 1)
 
 
-def _usual(frame: np.ndarray) -> float:
-    """Offset of the usual frame [frame]: 0, their mean, or the median where one is far from all others."""
+def typical_offset(frame: np.ndarray) -> float:
+    """Mean of the offsets of frames [frame], or their median where one is far from all others."""
     middle = float(np.median(frame))
     off = np.abs(frame - middle)
-    return middle if off.max() > FAR_FRAME * NORMAL_QUANTILE * np.median(off) else 0.0
+    return middle if off.max() > FAR_FRAME * NORMAL_QUANTILE * np.median(off) else float(frame.mean())
 
 
 def _hits(x: np.ndarray, sigma: float) -> tuple[tuple[np.ndarray, ...], np.ndarray]:

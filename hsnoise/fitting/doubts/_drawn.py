@@ -128,9 +128,7 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
 
 def _typical(group: Group, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels without outliers, DN^2, and its standard error."""
-    variance = group.pixels(c, "pair_variance_dn2").astype(np.float64)
-    kept = without_outliers(variance, group.n_frames)
-    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
+    return without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)
 
 
 def _median(group: Group, c: int) -> float:

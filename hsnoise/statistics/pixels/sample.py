@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hsnoise.statistics.apart import typical_offset
+
 MOST_PIXELS = 1 << 21  # sampled pixels of an exposure
 MOST_OF_ALL = 1 << 22  # of all exposures together
 MOST_COUNTS = 1 << 24  # pixels times frames of one exposure in memory
 MOST_OF_SPREAD = 100_000  # pixels from which the width of a distribution is taken
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from the values within
-FAR_FRAME = 5.0  # deviations beyond which a frame's offset is an outlier
 OUTLYING = 6.0  # deviations beyond which a pixel's temporal variance is not its noise
 NEIGHBOURS = 32  # pixels of a row that are compared with each other
 FEWEST_ROWS = 24  # enough for the offset of a column in a frame
@@ -59,9 +60,10 @@ def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
     return float(((a - a.mean()) * (b - b.mean())).mean())
 
 
-def without_outliers(variance: np.ndarray, n_frames: int) -> np.ndarray:
-    """Temporal variances [pixel] over so many frames, without outliers."""
-    return variance[is_no_outlier(variance, n_frames)]
+def without_outliers(variance: np.ndarray, n_frames: int) -> tuple[float, float]:
+    """Mean of the temporal variances [pixel] over so many frames, without outliers, and its standard error."""
+    kept = variance[is_no_outlier(variance, n_frames)]
+    return float(kept.mean()), float(kept.std() / np.sqrt(len(kept)))
 
 
 def is_no_outlier(variance: np.ndarray, n_frames: int) -> np.ndarray:
@@ -106,16 +108,9 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
         if h >= FEWEST_ROWS:
             frame -= (rest.sum(0, keepdims=True) - rest) / np.float32(h - 1)
         power += float(np.mean(rest**2))
-    values += np.float32(_typical(offsets))
+    values += np.float32(typical_offset(offsets))
     share = (1 / (w - 1) if w > 1 else 0.0) + (1 / (h - 1) if h >= FEWEST_ROWS else 0.0)
-    return offsets - _typical(offsets), np.float32(power / (n - 1) * share)
-
-
-def _typical(offsets: np.ndarray) -> float:
-    """Mean of the frames' offsets, or their median where one frame is far from all others."""
-    middle = float(np.median(offsets))
-    spread = 1.4826 * float(np.median(np.abs(offsets - middle)))
-    return middle if np.abs(offsets - middle).max() > FAR_FRAME * spread else float(offsets.mean())
+    return offsets - typical_offset(offsets), np.float32(power / (n - 1) * share)
 
 
 def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
