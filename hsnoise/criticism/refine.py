@@ -21,6 +21,7 @@ SHORT_STEP = 0.05  # of an unconstrained number: where a search ends
 DRAWS, SLOPE_DRAWS, PAIR_DRAWS, NEARBY_DRAWS = 6, 2, 12, 16
 STEP, LONGEST_STEP = 0.2, 1.0  # of an unconstrained number: mostly a logarithm
 PRIOR_SIGMA, BASE_SIGMA = 1.0, 0.3  # of unconstrained numbers of effects, and of the base
+BLACK_SIGMA = 0.1  # of a black level, in units of the read noise
 TINY = 1e-3  # a parameter of the base that is zero
 
 
@@ -84,7 +85,7 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> WithB
     own = bench.base.distribution.covariance
     model = bench.model.add(effect)
     of_effect, of_base = parameters_of(model, (effect.name,)).numbers, _base_numbers(model)
-    prior = np.repeat([PRIOR_SIGMA, BASE_SIGMA], [len(of_effect), len(of_base)]) ** -2
+    prior = np.array([PRIOR_SIGMA] * len(of_effect) + [_base_sigma(n, model) for n in of_base]) ** -2
     turned = of_numbers(model, (*of_effect, *of_base))
     slopes = np.concatenate(
         [
@@ -121,9 +122,21 @@ def _nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
 
 
 def _base_numbers(model: NoiseModel) -> list[Number]:
-    """The base parameters that are not zero; black levels follow from the means of the counts alone."""
-    names = [name for name in BASE if name in model and name != "black_level"]
-    return [n for n in numbers_of(model, names) if n.field == BASE[n.effect] and n.value_in(model) > TINY]
+    """The base parameters, without sizes that are zero.
+
+    All that a fit moves: a black level that stays behind, or an exponent of the row gain, would hold the others.
+    """
+    coloured = {"exponent"} if model.shutter == "rolling" else set()
+    numbers = numbers_of(model, [name for name in BASE if name in model])
+    moved = [n for n in numbers if n.field in {BASE[n.effect], *(coloured if n.effect == "row_gain" else ())}]
+    return [n for n in moved if n.spec.low is None or n.value_in(model) > TINY]
+
+
+def _base_sigma(number: Number, model: NoiseModel) -> float:
+    """Prior standard deviation of a base parameter's coordinate."""
+    if number.effect != "black_level":
+        return BASE_SIGMA
+    return BLACK_SIGMA * float(np.mean(np.asarray(model["gain"].value))) * float(model["read_noise"].sigma)
 
 
 def _shifts(model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench) -> np.ndarray:
