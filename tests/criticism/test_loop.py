@@ -244,7 +244,7 @@ def test_what_a_clamp_leaves_is_told_by_its_refit():
     found = hsnoise.diagnose(fit, stack)
     assert hsnoise.compare(fit.params, stack).error > 5
     assert found.verdict == "ambiguous" and found.names == ("black_clamp", "gain")
-    assert found.unexplained.misfit < 3.5 and not found.unexplained.statistics
+    assert found.unexplained.misfit < 3.5 and len(found.unexplained.statistics) < 4  # of about 300, beyond 3 by chance
 
 
 @pytest.mark.parametrize(
