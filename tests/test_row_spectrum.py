@@ -182,6 +182,15 @@ def test_a_free_share_is_fitted_together_with_an_added_effect():
     assert max(abs(found[name]) for name in ("gain", "row_gain.white_share", "row_noise.sigma")) < 4, found
 
 
+def test_white_rows_of_a_rolling_shutter_recall_the_global_one():
+    """White rows move the mean of a frame, coloured ones do not: it would be called frame_offset."""
+    told = {}
+    for shutter in ("rolling", "global"):
+        fitted = hsnoise.fit(capture(camera(0.0, 1.0), frames=6, shutter=shutter))
+        told[shutter] = any("shutter='global'" in note for note in fitted.notes)
+    assert told == {"rolling": True, "global": False}
+
+
 def test_the_line_fit_refuses_a_white_share(mixture):
     model, stack, _, _ = mixture
     with pytest.raises(ValueError, match=r"method: the line fit has no row_gain.white_share"):
