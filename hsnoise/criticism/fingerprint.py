@@ -9,6 +9,7 @@ import numpy as np
 
 from hsnoise.criticism.candidates import made
 from hsnoise.effects import Maker
+from hsnoise.likelihood.parameters import read_noise_dn
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import Gaussian
 from hsnoise.simulation.reference import Reference
@@ -128,8 +129,7 @@ def _moved_models(model: NoiseModel) -> list[tuple[NoiseModel, float]]:
             continue
         value = np.asarray(getattr(model[name], what), float)
         # A black level is off by a share of the noise, not of itself.
-        noise_dn = float(np.mean(np.asarray(model["gain"].value))) * float(model["read_noise"].sigma)
-        steps = np.full(value.shape, 0.5 * STEP * noise_dn) if name == "black_level" else STEP * value
+        steps = np.full(value.shape, 0.5 * STEP * read_noise_dn(model)) if name == "black_level" else STEP * value
         for i in np.ndindex(value.shape):
             changed = value.copy()
             changed[i] += steps[i]

@@ -12,7 +12,7 @@ import numpy as np
 from hsnoise.criticism.fingerprint import BASE, NEARBY_ERROR, RELATIVE_ERROR, Bench, distribution_of
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
-from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of
+from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of, read_noise_dn
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import Gaussian, share_of_far
 
@@ -124,19 +124,16 @@ def _nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
 def _base_numbers(model: NoiseModel) -> list[Number]:
     """The base parameters, without sizes that are zero.
 
-    All that a fit moves: a black level that stays behind, or an exponent of the row gain, would hold the others.
+    A black level that stays where the fit left it, or an exponent of the row gain, would hold the others.
     """
-    coloured = {"exponent"} if model.shutter == "rolling" else set()
-    numbers = numbers_of(model, [name for name in BASE if name in model])
-    moved = [n for n in numbers if n.field in {BASE[n.effect], *(coloured if n.effect == "row_gain" else ())}]
-    return [n for n in moved if n.spec.low is None or n.value_in(model) > TINY]
+    moved = {*BASE.items(), *([("row_gain", "exponent")] if model.shutter == "rolling" else ())}
+    numbers = [n for n in numbers_of(model, [name for name in BASE if name in model]) if n.place in moved]
+    return [n for n in numbers if n.spec.low is None or n.value_in(model) > TINY]
 
 
 def _base_sigma(number: Number, model: NoiseModel) -> float:
     """Prior standard deviation of a base parameter's coordinate."""
-    if number.effect != "black_level":
-        return BASE_SIGMA
-    return BLACK_SIGMA * float(np.mean(np.asarray(model["gain"].value))) * float(model["read_noise"].sigma)
+    return BLACK_SIGMA * read_noise_dn(model) if number.effect == "black_level" else BASE_SIGMA
 
 
 def _shifts(model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench) -> np.ndarray:

@@ -97,6 +97,11 @@ def numbers_of(model: NoiseModel, effects: Iterable[str] | None = None) -> list[
     return found
 
 
+def read_noise_dn(model: NoiseModel) -> float:
+    """Read noise at the mean gain of the channels, DN."""
+    return float(np.mean(np.asarray(model["gain"].value))) * float(model["read_noise"].sigma)
+
+
 def within_bounds(model: NoiseModel) -> NoiseModel:
     """The model in float64 with its numbers within the bounds that effects declare, which a search may have left."""
     with jax.enable_x64(True):

@@ -20,7 +20,7 @@ from hsnoise.fitting.flat_notes import gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method
-from hsnoise.likelihood.parameters import numbers_of
+from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
 from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
@@ -79,7 +79,7 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         return
     pixel: PixelFit | None = result.transfer
     if pixel is None:
-        read_dn = float(np.mean(np.asarray(result.params["gain"].value))) * float(result.params["read_noise"].sigma)
+        read_dn = read_noise_dn(result.params)
         yield f"The gain is not determined: these darks do not show it. Read noise is {read_dn:.4g} DN. {ADD}"
         return
     floor = float(np.mean([c.values[1] for c in pixel.channels]))

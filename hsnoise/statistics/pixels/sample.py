@@ -108,9 +108,10 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
         if h >= FEWEST_ROWS:
             frame -= (rest.sum(0, keepdims=True) - rest) / np.float32(h - 1)
         power += float(np.mean(rest**2))
-    values += np.float32(typical_offset(offsets))
+    typical = typical_offset(offsets)
+    values += np.float32(typical)
     share = (1 / (w - 1) if w > 1 else 0.0) + (1 / (h - 1) if h >= FEWEST_ROWS else 0.0)
-    return offsets - typical_offset(offsets), np.float32(power / (n - 1) * share)
+    return offsets - typical, np.float32(power / (n - 1) * share)
 
 
 def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
