@@ -40,6 +40,8 @@ PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, to test whether pi
 SMALLEST = 8  # rows and columns; fewer say nothing about rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")
+WHITE_SIGMA, WHITE_BELOW = 3.0, 0.5  # standard errors, and their size, within which an exponent may be that of white rows
+LIKELIER = float(np.log(20))  # nats by which they are preferred: odds of 20 to 1
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
     "{} lies at a step of the likelihood, where rows whose gain the model clips at 0 are rounded to the next count: it"
@@ -74,7 +76,7 @@ def fit(
             exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`. Its values are not
             used, except `row_gain.white_share`: 0 and 1 are held, and any other value is where its search starts.
-            Default: all of the paper's, without a white share. Effects beyond the paper's are fitted by simulated
+            Default: all of the paper's, the row gain coloured, or white if the likelihood prefers that. Effects beyond the paper's are fitted by simulated
             statistics, together with all others (`hsnoise.synthetic`); their values are where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "transfer" pixel
             transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", as the result then
@@ -164,7 +166,7 @@ def _pooled(summary: Summary, model: NoiseModel | None, method: str) -> FitResul
             if (outside > OUTLIERS_FROM).any():
                 result, converged = _by_likelihood(summary, model, start, _set_apart(outside))
         if converged:
-            return result
+            return result if model is not None else _white_if_likelier(result, summary, outside)
         if method == "ml" or with_clamp or white_share is not None:
             raise RuntimeError(f"fit: maximum likelihood did not converge: {result.detail}")
         return _by_line(summary, model, Status.LINE_INSTEAD, result.detail)
@@ -306,6 +308,19 @@ def _by_likelihood(summary: Summary, model, start: NoiseModel, outliers) -> tupl
     )
     at_edges = tuple(AT_EDGE.format(name) for name, edge in zip(coordinates.names, edges, strict=True) if edge)
     return result.with_notes((*at_edges, *closing_notes(result))), maximum.converged
+
+
+def _white_if_likelier(result: FitResult, summary: Summary, outside: np.ndarray) -> FitResult:
+    """The fit with a white row gain, where the exponent is compatible with 0 and the likelihood prefers white rows.
+
+    Both spectra are flat, but only white rows move the mean of a frame, which would pass for another effect.
+    """
+    exponent, error, _ = result.table["row_gain.exponent"]
+    if "row_gain.exponent" not in result.names or not abs(exponent) < WHITE_SIGMA * error < WHITE_BELOW:
+        return result
+    start = result.params.with_value("row_gain", "white_share", 1.0).with_value("row_gain", "exponent", 0.0)
+    white, converged = _by_likelihood(summary, None, start, _set_apart(outside))
+    return white if converged and white.log_likelihood > result.log_likelihood + LIKELIER else result
 
 
 def _edges(covariance: np.ndarray, coordinates: Coordinates, found: NoiseModel, summary: Summary) -> np.ndarray:

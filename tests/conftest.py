@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from hsnoise.chain.signals import apply_by_effect
 from hsnoise.criticism import candidates
 
 jax.config.update("jax_enable_x64", True)
@@ -41,6 +42,18 @@ def keep_compiled_programs(tmp_path_factory, worker_id):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "compiled"))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def draw_effect_by_effect(request):
+    """Compiles each effect once for all models that have it: a third of the time was compiling whole models.
+
+    Modules about the compiled sampler are marked `in_one`; it draws the same counts, as tests/test_model.py shows.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("in_one") is None:
+            patch.setattr("hsnoise.model.apply_in_one", apply_by_effect)
+        yield
 
 
 @pytest.fixture

@@ -182,13 +182,21 @@ def test_a_free_share_is_fitted_together_with_an_added_effect():
     assert max(abs(found[name]) for name in ("gain", "row_gain.white_share", "row_noise.sigma")) < 4, found
 
 
-def test_white_rows_of_a_rolling_shutter_recall_the_global_one():
-    """White rows move the mean of a frame, coloured ones do not: it would be called frame_offset."""
-    told = {}
-    for shutter in ("rolling", "global"):
-        fitted = hsnoise.fit(capture(camera(0.0, 1.0), frames=6, shutter=shutter))
-        told[shutter] = any("shutter='global'" in note for note in fitted.notes)
-    assert told == {"rolling": True, "global": False}
+@pytest.mark.parametrize("white_share", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+def test_the_likelihood_tells_white_rows_from_flat_ones_of_mean_one(white_share):
+    """White rows move the mean of a frame: it would be called frame_offset."""
+    result = hsnoise.fit(capture(camera(0.0, white_share), frames=6))
+    assert result.table["row_gain.white_share"] == (white_share, 0.0, "1")
+    assert ("row_gain.exponent" in result.names) == (white_share == 0)
+    assert any("rows of a frame" in note or "mean of their frame" in note for note in result.notes)
+
+
+@pytest.mark.slow
+def test_a_share_of_none_that_is_asked_for_stays():
+    model = camera(0.0, 1.0)
+    result = hsnoise.fit(capture(model, frames=6), model=with_share(model, 0.0))
+    assert result.table["row_gain.white_share"] == (0.0, 0.0, "1")
+    assert "row_gain.exponent" in result.names
 
 
 def test_the_line_fit_refuses_a_white_share(mixture):

@@ -83,10 +83,9 @@ def _row_gain_note(number: Number, value: float, error: float, result: FitResult
     if number.field == "exponent" and fitted and error > 0.4:
         return f"{name} is not determined: the row gain is too weak here, or too white, to have a spectrum."
     if number.field == "exponent" and fitted and abs(value) < 2 * error:
-        return (
-            f"{name} is compatible with 0: rows fluctuate independently, as with a global shutter. If the camera has"
-            " one, pass shutter='global' (--shutter global), or fluctuating frames will look like frame_offset."
-        )
+        return f"{name} is compatible with 0: rows of a frame fluctuate independently."
+    if number.field == "white_share" and not fitted and value == 1:
+        return f"{name} is 1: rows fluctuate independently and move the mean of their frame, as with a global shutter."
     if number.field == "white_share" and fitted and error > 0.1:
         return f"{name} and row_gain.exponent can hardly be separated, and their errors are rough: add frames."
     return None

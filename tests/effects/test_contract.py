@@ -285,7 +285,8 @@ def test_vmap_is_a_loop(effect):
         return sample(key, signal(), scaled, exposure_s=0.1 * scale)
 
     looped = np.stack([draw(*pair) for pair in zip(keys, scales, strict=True)])
-    np.testing.assert_allclose(jax.vmap(draw)(keys, scales), looped, rtol=1e-12)
+    # Programs that are compiled apart contract products and sums differently: another last bit of float32.
+    np.testing.assert_allclose(jax.vmap(draw)(keys, scales), looped, rtol=1e-7)
 
 
 @each_effect
