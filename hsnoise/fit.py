@@ -40,7 +40,7 @@ PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, to test whether pi
 SMALLEST = 8  # rows and columns; fewer say nothing about rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")
-WHITE_SIGMA, WHITE_BELOW = 3.0, 0.5  # standard errors, and their size, within which an exponent may be that of white rows
+WHITE_SIGMA, WHITE_BELOW = 3.0, 0.5  # standard errors, and what they are at most, within which rows may be white
 LIKELIER = float(np.log(20))  # nats by which they are preferred: odds of 20 to 1
 EDGE_DN = 0.5  # from the middle of a count to where it is rounded to the next
 AT_EDGE = (
@@ -76,8 +76,9 @@ def fit(
             exposure.
         model: which effects to fit, for example `hsnoise.cameras.canon_5d3().remove("row_gain")`. Its values are not
             used, except `row_gain.white_share`: 0 and 1 are held, and any other value is where its search starts.
-            Default: all of the paper's, the row gain coloured, or white if the likelihood prefers that. Effects beyond the paper's are fitted by simulated
-            statistics, together with all others (`hsnoise.synthetic`); their values are where the search starts.
+            Default: all of the paper's, with a white row gain where the likelihood prefers one. Effects beyond the
+            paper's are fitted by simulated statistics, together with all others (`hsnoise.synthetic`); their values are
+            where the search starts.
         method: "ml" joint maximum likelihood; "line" the paper's line fit with clip-correction tables; "transfer" pixel
             transfer alone; "auto" is "ml", and if that does not converge, "transfer" or "line", as the result then
             states. With effects beyond the paper's it is the method of the fit before the simulation.
