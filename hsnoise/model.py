@@ -336,6 +336,8 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
         params.shutter,
         sensor_key,
         gain=next((effect.value for effect in effects if effect.name == "gain"), None),
+        # Read noise may be merged with the arrivals.
+        read_noise=jax.lax.convert_element_type(params["read_noise"].sigma, dtype) if "read_noise" in params else None,
         window=window,
     )
     shape = (math.prod(clean.shape[:-2]), *capture.shape)

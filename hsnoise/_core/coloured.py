@@ -116,6 +116,19 @@ def row_gain_power(n: int, exponent: Scalar, white_share: Scalar | float | None 
     return coloured if white_share is None else (1 - white_share) * coloured + white_share
 
 
+def power_of_ringing(n: int, frequency: Scalar, memory: Scalar) -> jax.Array:
+    """Spectrum [n] of a series whose correlation k apart is memory^k cos(2 pi frequency k), frequency in cycles/place.
+
+    Scaled to a mean of 1: what wraps around a series that is shorter than its memory would add to the variance.
+    """
+    turn = 2 * jnp.pi * jnp.fft.fftfreq(n).astype(memory.dtype)
+    both = sum(
+        (1 - memory**2) / (1 - 2 * memory * jnp.cos(turn + sign * 2 * jnp.pi * frequency) + memory**2)
+        for sign in (-1, 1)
+    )
+    return both / jnp.mean(both)
+
+
 def coloured_normal(key: RandomKey, shape: tuple[int, int, int], power: jax.Array, dtype: jnp.dtype) -> jax.Array:
     """Stationary periodic normal series along axis 1 of `shape`, with independent bins of mean `power` [shape[1]]."""
     white = jax.random.normal(key, shape, dtype)

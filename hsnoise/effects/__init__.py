@@ -16,6 +16,7 @@ from hsnoise.effects.black_level import BlackLevel
 from hsnoise.effects.black_shading import BlackShading
 from hsnoise.effects.column_fixed_pattern import ColumnFixedPattern
 from hsnoise.effects.column_noise import ColumnNoise
+from hsnoise.effects.correlated_read_noise import CorrelatedReadNoise
 from hsnoise.effects.cosmic_rays import CosmicRays
 from hsnoise.effects.crosstalk import Crosstalk
 from hsnoise.effects.dark_current import DarkCurrent
@@ -79,6 +80,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     RandomTelegraphNoise,
     HeavyTailedReadNoise,
     ReadNoiseNonuniformity,
+    CorrelatedReadNoise,
     PeriodicBanding,
     Crosstalk,
     ReadoutBandwidth,
@@ -112,6 +114,7 @@ __all__ = [
     "CaptureFacts",
     "ColumnFixedPattern",
     "ColumnNoise",
+    "CorrelatedReadNoise",
     "CosmicRays",
     "Crosstalk",
     "DarkCurrent",

@@ -73,6 +73,7 @@ class Capture(eqx.Module):
         shutter: "rolling" or "global".
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
         gain: system gain [channel], DN/e-; None if the model has none.
+        read_noise: its sigma, rms over pixels, e-; None if the model has none.
         read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
         dark_current_scale: factor on the dark current of each pixel, as above.
         differentiable: whether counts are floats with a derivative, which ignores rounding.
@@ -88,6 +89,7 @@ class Capture(eqx.Module):
     read_noise_scale: Frames | PixelMap | None = None
     dark_current_scale: Frames | PixelMap | None = None
     gain: PerChannel | None = None
+    read_noise: Scalar | None = None
     differentiable: bool = eqx.field(static=True, default=False)
     window: Window | None = eqx.field(static=True, default=None)
     moved: tuple[jax.Array, jax.Array] | None = None
@@ -214,8 +216,9 @@ class AbstractEffect(eqx.Module):
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> Frames | PixelMap | None:
         """Factor on the read noise of each pixel, [frame or 1, row, column], for a signal of `shape`; None: 1.
 
-        Its mean square must be 1, so that the sigma of the read noise remains its rms. The factors of all effects
-        multiply. Thus an effect can modify the read noise without knowing the effect that draws it.
+        Its mean square must be 1, or less by what the effect's own `sample` adds, so that the sigma of the read noise
+        remains its rms. The factors of all effects multiply. Thus an effect can modify the read noise without knowing
+        the effect that draws it.
         """
         return None
 

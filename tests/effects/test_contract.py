@@ -25,6 +25,7 @@ from hsnoise.effects import (
     Capture,
     ColumnFixedPattern,
     ColumnNoise,
+    CorrelatedReadNoise,
     CosmicRays,
     Crosstalk,
     DarkCurrent,
@@ -96,6 +97,7 @@ EXAMPLES = [
     RandomTelegraphNoise(0.5, 8.0, 0.4),
     HeavyTailedReadNoise(6.0),
     ReadNoiseNonuniformity(0.4),
+    CorrelatedReadNoise(0.3, 0.5, 0.4),
     PeriodicBanding(2.0, 0.13),
     Crosstalk(0.03),
     ReadoutBandwidth(0.1),
@@ -136,7 +138,7 @@ DETERMINISTIC = (
     | MeasuredMap
     | MeasuredResponse
 )
-SHAPE_READ_NOISE = HeavyTailedReadNoise | ReadNoiseNonuniformity
+SHAPE_READ_NOISE = HeavyTailedReadNoise | ReadNoiseNonuniformity | CorrelatedReadNoise
 each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: effect.name)
 
 

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise.effects import HeavyTailedReadNoise, RandomTelegraphNoise, ReadNoise, ReadNoiseNonuniformity
+from hsnoise.effects import (
+    CorrelatedReadNoise,
+    HeavyTailedReadNoise,
+    RandomTelegraphNoise,
+    ReadNoise,
+    ReadNoiseNonuniformity,
+    ShotNoise,
+)
 from hsnoise.effects.heavy_tailed_read_noise import LARGEST_LOGIT, log_quantiles
-from hsnoise.model import NoiseModel, sample_dark
+from hsnoise.model import NoiseModel, sample, sample_dark
 
 KEY = jax.random.key(37)
 P_VALUE = 1e-5
@@ -68,6 +75,43 @@ def test_nonuniform_read_noise_is_log_normal_over_pixels_of_the_same_rms():
     assert abs(variance.mean() - 9) < 5 * variance.std() / np.sqrt(variance.size)
     one = drawn / np.sqrt(variance)
     assert abs(np.mean(one**4) - 3 * frames / (frames + 2)) < 5 * np.sqrt(96 / one.size)
+
+
+def correlations(drawn, lags):
+    """Correlation of pixels so far apart in their row [lag], and its error by chance."""
+    found = [np.mean(drawn[:, :, lag:] * drawn[:, :, : drawn.shape[2] - lag]) for lag in lags]
+    return np.array(found) / np.mean(drawn**2), 1 / np.sqrt(drawn.size)
+
+
+@pytest.mark.parametrize(("frequency", "memory"), [(0.5, 0.3), (0.0, 0.8), (0.23, 0.9)])
+def test_correlated_read_noise_has_the_stated_correlations_and_the_same_rms(frequency, memory):
+    drawn = darks(8, (100, 500), ReadNoise(3.0), CorrelatedReadNoise(0.4, frequency, memory))
+    lags = np.arange(1, 6)
+    found, chance = correlations(drawn, lags)
+    stated = 0.4 * memory**lags * np.cos(2 * np.pi * frequency * lags)
+    assert np.all(np.abs(found - stated) < 5 * chance), found - stated
+    assert abs(np.mean(drawn**2) / 9 - 1) < 5 * np.sqrt(2 / drawn.size * (1 + 2 * np.sum(stated**2)))
+    down = np.mean(drawn[:, 1:] * drawn[:, :-1]) / 9
+    assert abs(down) < 5 * chance * np.sqrt(1 + 2 * np.sum(stated**2))
+
+
+def test_noise_that_outlasts_the_row_keeps_its_rms():
+    drawn = darks(200, (50, 6), ReadNoise(3.0), CorrelatedReadNoise(1.0, 0.1, 0.99))
+    each = np.mean(drawn**2, 2) / 9  # rows are independent
+    assert abs(each.mean() - 1) < 5 * each.std() / np.sqrt(each.size)
+
+
+@pytest.mark.parametrize("light", [0.0, 60.0])
+def test_shot_noise_is_not_correlated_with_the_read_noise_of_its_neighbours(light):
+    model = NoiseModel(
+        [ShotNoise(), ReadNoise(3.0), CorrelatedReadNoise(0.6, 0.5, 0.5)],
+        cfa="mono",
+        shutter="rolling",
+        exposure_s=0.05,
+    )
+    drawn = np.asarray(sample(KEY, np.full((6, 80, 400), light), model)) - light
+    found, chance = correlations(drawn, [1])
+    assert abs(found[0] + 0.3 * 9 / (9 + light)) < 5 * chance
 
 
 def test_two_shapes_multiply():
