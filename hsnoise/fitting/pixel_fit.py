@@ -18,6 +18,7 @@ from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.read_noise import read_noise_spread
@@ -83,11 +84,13 @@ class Channel:
 class PixelFit:
     """The channels, the gain of the flats if there are any, and the joint estimate with its covariance.
 
+    ringing: the part of the read noise that goes on along rows, if it is there.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
     channels: tuple[Channel, ...]
     flats: FlatGain | None
+    ringing: Ringing | None
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -103,7 +106,9 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
     known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
-    return PixelFit(tuple(channels), flats, estimate, covariance, bool(known.all()))
+    read_dn2 = float(np.mean([max(one.values[1] - ROUNDING, ROUNDING) for one in channels]))
+    ringing = of_read_noise([group.along for group in found.groups if group.along is not None], read_dn2)
+    return PixelFit(tuple(channels), flats, ringing, estimate, covariance, bool(known.all()))
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:

@@ -14,6 +14,7 @@ from hsnoise.effects import (
     BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
+    CorrelatedReadNoise,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     FrameOffset,
@@ -52,6 +53,7 @@ OF_PIXELS = (
     RowBankNoise,
     ColumnNoise,
     BlackShading,
+    CorrelatedReadNoise,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -152,6 +154,8 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     noise_spread = _mean([c.noise_spread for c in pixel.channels])
     if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
         found["read_noise_nonuniformity"] = {"spread": noise_spread}
+    if pixel.ringing is not None:
+        found["correlated_read_noise"] = pixel.ringing._asdict()
     response = _mean([c.photo_response for c in pixel.channels])
     if response[0] > max(THERE * response[1], LEAST_RESPONSE):
         found["photo_response_nonuniformity"] = {"sigma": response}

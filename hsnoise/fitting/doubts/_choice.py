@@ -25,8 +25,9 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
     found, summary = seen.survey, seen.summary
     if method == "line" or not can_be_transferred(found):
         return False
-    if not found.has_exposures:  # flats give the gain: a likelihood adds nothing, and rows of real sensors bias it
-        return summary.flats is not None and has_patterns(found)
+    if not found.has_exposures:
+        # A likelihood adds nothing where flats give the gain, or bias frames none, and rows of real sensors bias it.
+        return (summary.flats is not None or not summary.exposure_s.any()) and has_patterns(found)
     fell = fall_of(found) is not None  # pedestals that jump this far look like a signal
     if variance_grows(found) and not fell:
         return False

@@ -12,6 +12,7 @@ from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouring_rows, with_tails
 from hsnoise.statistics.narrow_noise import narrow_read_noise
+from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -57,7 +58,10 @@ class OddLines(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes."""
+    """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes.
+
+    along: what pixels share of their temporal noise along rows; None if the frames do not show it.
+    """
 
     exposure_s: float
     kind: str
@@ -66,6 +70,7 @@ class Group:
     saturated_share: np.ndarray
     odd_lines: OddLines
     planes: tuple[Plane, ...]
+    along: Along | None
 
     def of(self, channel: int) -> list[Plane]:
         """The planes of one channel."""
@@ -172,8 +177,9 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
     planes = tuple(
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
     )
-    group = Group(float(stack.exposure_s[i]), stack.kind[i], n, clipped / pixels, saturated / pixels, odd, planes)
-    return group, highest
+    conditions = float(stack.exposure_s[i]), stack.kind[i], n
+    along = along_rows(kept, step)
+    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, along), highest
 
 
 def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:

@@ -1,0 +1,71 @@
+"""Temporal noise that neighbours in a row share: of the read noise, or of the signal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise import effects as fx
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.statistics.pixels.along_rows import along_rows, of_read_noise
+
+READ_DN2 = (12.0 * 0.5) ** 2
+
+
+def drawn(effect, exposure_s, *, seed=5, frames=8, shape=(200, 256), more=()):
+    """A capture of a CCD whose dark current is as noisy as its readout after a minute."""
+    camera = [fx.ShotNoise(), fx.DarkCurrent(2.4), fx.ReadNoise(12.0), fx.Gain(0.5), fx.BlackLevel(900.0), fx.ADC(None)]
+    model = hsnoise.NoiseModel([*camera, effect, *more], cfa="mono", shutter="rolling", exposure_s=60.0)
+    empty = [np.arange(frames * np.prod(shape), dtype=np.uint16).reshape(frames, *shape) for _ in exposure_s]
+    return draw_capture(seed, model, hsnoise.FrameStack(empty, exposure_s))
+
+
+def groups(stack):
+    return [along_rows(np.stack(list(stack.frames(i))), 1) for i in range(stack.n_exposures)]
+
+
+@pytest.mark.parametrize(("frequency", "memory"), [(0.5, 0.3), (0.0, 0.7), (0.21, 0.8)])
+def test_a_part_of_the_read_noise_is_found_with_its_size(frequency, memory):
+    stack = drawn(fx.CorrelatedReadNoise(0.25, frequency, memory), (0.0, 60.0))
+    found = of_read_noise(groups(stack), READ_DN2)
+    assert found is not None
+    for (value, error), true in zip(found, (0.25, frequency, memory), strict=True):
+        assert abs(value - true) <= 4 * error + 0.005  # half a step of the grid
+
+
+@pytest.mark.parametrize("effect", [fx.ReadoutBandwidth(0.06), fx.ReadoutOvershoot(0.06), fx.RowNoise(1.0)])
+def test_what_acts_on_the_signal_or_on_rows_is_not_read_noise(effect):
+    for exposure_s in ((0.0, 60.0), (0.0,)):
+        assert of_read_noise(groups(drawn(effect, exposure_s)), READ_DN2) is None
+
+
+def test_bias_frames_alone_show_it_where_it_reaches_two_pixels_far():
+    far, near = (
+        drawn(fx.CorrelatedReadNoise(share, 0.5, memory), (0.0,)) for share, memory in ((0.2, 0.6), (0.9, 0.1))
+    )
+    assert of_read_noise(groups(far), READ_DN2) is not None
+    assert of_read_noise(groups(near), READ_DN2) is None
+
+
+def test_columns_of_two_amplifiers_are_no_neighbours():
+    rng = np.random.default_rng(3)
+    noise = rng.normal(0, 3, (8, 200, 256)) + np.repeat(rng.normal(0, 1, (8, 200, 2)), 128, axis=2)
+    noise += np.tile(rng.normal(0, 1, (8, 200, 2)), 128)  # even and odd columns of a row wander apart
+    assert of_read_noise([along_rows(np.rint(noise + 900).astype(np.uint16), 1)], 9.0) is None
+
+
+@pytest.mark.parametrize("counts", [np.zeros((1, 40, 80)), np.zeros((4, 40, 30)), np.zeros((4, 40, 80))])
+def test_frames_that_cannot_show_it_give_nothing(counts):
+    assert along_rows(counts.astype(np.uint16), 1) is None
+
+
+def test_a_fit_adds_it_and_keeps_gain_and_read_noise():
+    hot = fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)
+    stack = drawn(fx.CorrelatedReadNoise(0.3, 0.5, 0.4), (0.0, 20.0, 60.0), more=hot)
+    result = hsnoise.fit(stack)
+    assert "correlated_read_noise" in result.added
+    truth = {"gain": 0.5, "read_noise.sigma": 12.0, "correlated_read_noise.share": 0.3}
+    for name, true in truth.items():
+        value, error, _ = result.table[name]
+        assert abs(value - true) < 4 * error + 0.005, (name, value, error)
