@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 
@@ -48,6 +49,7 @@ MODEST = {
     "random_telegraph_noise": 0.03,  # of the pixels, 12 e-
     "heavy_tailed_read_noise": 5.0,  # degrees of freedom
     "read_noise_nonuniformity": 0.35,
+    "correlated_read_noise": 0.2,  # of the variance
     "periodic_banding": 0.8,  # e-
     "crosstalk": 0.02,
     "readout_bandwidth": 0.05,
@@ -170,6 +172,8 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
     elif effect == "read_noise_nonuniformity":
         spread = np.exp(size * rng.standard_normal(shape))
         out["read"] = spread / np.sqrt((spread**2).mean())
+    elif effect == "correlated_read_noise":
+        out["memory"], out["alternates"] = float(rng.uniform(0.3, 0.8)), bool(rng.integers(2))
     elif effect == "periodic_banding":
         out["frequency"] = float(rng.uniform(0.03, 0.45))
     elif effect == "block_offsets":
@@ -200,6 +204,8 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     noise = rng.standard_normal(whole)
     if freedom := sizes.get("heavy_tailed_read_noise"):
         noise = rng.standard_t(freedom, whole) * np.sqrt((freedom - 2) / freedom)
+    if share := sizes.get("correlated_read_noise"):
+        noise = np.sqrt(1 - share) * noise + np.sqrt(share) * _along_rows(hidden, rng, whole)
     x += camera.read * noise * hidden.get("read", 1.0) + hidden.get("offset", 0.0)
     for effect, size in sizes.items():
         x += _moving(effect, size, hidden, rng, frames, shape)
@@ -211,6 +217,15 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
         x = np.minimum(x, 0.5 / curvature)  # constant beyond the maximum
         x = x - curvature * np.maximum(x, 0) ** 2
     return _digital(camera, sizes, x * hidden.get("gain", 1.0), hidden.get("black", 0.0), t, rng)
+
+
+def _along_rows(hidden, rng, shape: tuple[int, ...]) -> np.ndarray:
+    """Noise of unit variance that goes on from pixel to pixel of a row, as it is or with alternating sign."""
+    memory = hidden["memory"]
+    kicks = rng.standard_normal(shape) * np.sqrt(1 - memory**2)
+    kicks[..., 0] /= np.sqrt(1 - memory**2)
+    noise = lfilter([1.0], [1.0, -memory], kicks, axis=-1)
+    return noise * (-1.0) ** np.arange(shape[-1]) if hidden["alternates"] else noise
 
 
 def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float:

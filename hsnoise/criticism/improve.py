@@ -49,6 +49,7 @@ from hsnoise.simulation.simulator import Purpose
 log = logging.getLogger(__name__)
 
 MOST_TRIED = 4  # effects, where none explains all
+PASSING = 12  # draws for a comparison that nothing depends on, of a model that is far off
 
 
 def improve(
@@ -226,10 +227,10 @@ class _Work:
 
         return tick
 
-    def step(self, result: FitResult, added: str | None, steps: Sequence[Step]) -> Step:
+    def step(self, result: FitResult, added: str | None, steps: Sequence[Step], draws: int = DRAWS) -> Step:
         """The step after `steps`."""
-        tick = self.counter(_stage("comparing with the model's samples", steps), DRAWS)
-        comparison = compared(result.params, self.portion, seed=self.seed, tick=tick)
+        tick = self.counter(_stage("comparing with the model's samples", steps), draws)
+        comparison = compared(result.params, self.portion, draws=draws, seed=self.seed, tick=tick)
         comparison = with_shares(comparison, result.params, self.portion, self.seed)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
         unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
@@ -244,10 +245,11 @@ class _Work:
 
     def begun(self, first: FitResult) -> list[Step]:
         """The first steps: the paper's model, then one by one what its fit measured beyond it."""
-        steps = [self.step(first.without(first.added), None, [])]
+        draws = [*[PASSING] * len(first.added), DRAWS]
+        steps = [self.step(first.without(first.added), None, [], draws[0])]
         for i, name in enumerate(first.added):
             self.say(_stage(f"adding {name}, as measured", steps))
-            steps.append(self.step(first.without(first.added[i + 1 :]), name, steps))
+            steps.append(self.step(first.without(first.added[i + 1 :]), name, steps, draws[i + 1]))
         return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
 
     def pixels_followed(self, steps: Sequence[Step]) -> FitResult | None:

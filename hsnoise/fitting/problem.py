@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise.effects import Stage
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
@@ -24,6 +25,8 @@ PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the d
 MOST_SPREAD = 0.25  # variance of base parameters, relative to their size, above which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # in the logarithm of an effect's parameter; in sizes of a base parameter
 UNKNOWN = 100.0  # standard error, in sizes, of what the base fit does not know
+HELD = 1e-6  # of its standard error, by which a gain varies that is held
+ON_SIGNAL = (Stage.COUPLING, Stage.MULTIPLICATION, Stage.READOUT, Stage.GAIN)  # the photon transfer line shows it
 SCORE_ERROR = 0.3  # least error of the score in whitened units, whose deviation is 1 if the base fit is right
 
 
@@ -74,6 +77,17 @@ class Problem:
         share = np.minimum(1.0, UNKNOWN / np.sqrt(np.diagonal(covariance)))
         return np.linalg.eigh(covariance * share[:, None] * share[None, :])
 
+    @property
+    def holds_gain(self) -> bool:
+        """Whether the gain stays where pixels over time, or flats, have put it.
+
+        Noise beside the signal does not bias it there. Statistics of all pixels would move it for whatever the model
+        still lacks.
+        """
+        effects = [self.model[name] for name in self.extra]
+        on_signal = any(one.acts_at in ON_SIGNAL or one.confounded_with == "gain" for one in effects)
+        return self.base.transfer is not None and self.base.has_gain and not on_signal
+
     def _base_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Covariance of the base fit in the order of the coordinates, and which of these it did not fit."""
         names, fitted = self.coordinates.names, self.base.names
@@ -81,6 +95,10 @@ class Problem:
         here = [i for i, name in enumerate(names) if name in fitted]
         there = [fitted.index(names[i]) for i in here]
         covariance[np.ix_(here, here)] = self.base.covariance[np.ix_(there, there)]
+        if self.holds_gain:
+            gains = self.coordinates.where("gain")
+            covariance[gains] *= HELD
+            covariance[:, gains] *= HELD
         return covariance, ~np.isfinite(np.diagonal(covariance))
 
     @cached_property

@@ -13,7 +13,7 @@ from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.structure import check_size
 
-MOST_PIXELS = 4_000_000
+MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and draws slower
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 BOTH = ("dark", "flat")
