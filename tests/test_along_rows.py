@@ -7,7 +7,9 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise.fitting.problem import Problem
 from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 from hsnoise.statistics.pixels.along_rows import along_rows, of_read_noise
 
 READ_DN2 = (12.0 * 0.5) ** 2
@@ -69,3 +71,17 @@ def test_a_fit_adds_it_and_keeps_gain_and_read_noise():
     for name, true in truth.items():
         value, error, _ = result.table[name]
         assert abs(value - true) < 4 * error + 0.005, (name, value, error)
+
+
+@pytest.mark.parametrize(
+    ("extra", "held"), [(fx.RowNoise(2.0), True), (fx.CosmicRays(2.0, 500.0), True), (fx.Crosstalk(0.02), False)]
+)
+def test_a_refit_holds_a_gain_of_pixels_over_time_unless_the_signal_is_changed(extra, held):
+    stack = drawn(fx.HotPixels(0.02, 20.0), (0.0, 20.0, 60.0), more=(fx.DarkCurrentNonuniformity(0.3),))
+    base = hsnoise.fit(stack)
+    model = base.params.add(extra)
+    problem = Problem(Portion.of(stack), base, model, (extra.name,), model)
+    far = problem.at(problem.start + 100.0)
+    value, error, _ = base.table["gain"]
+    assert problem.holds_gain == held
+    assert (abs(float(far["gain"].value[0]) - value) < 0.01 * error) == held

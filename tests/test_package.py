@@ -54,7 +54,7 @@ for name in ("BM3D", "BM4D over frames"):
 
 
 def run(*words: str | Path, cwd: Path, ends: tuple[int, ...] = (0,)) -> str:
-    """What a command prints, run outside of the checkout; fails with what it says unless its status is one of `ends`."""
+    """What a command prints, run outside of the checkout; fails with what it says unless it `ends` as expected."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run([*map(str, words)], cwd=cwd, env=clean, capture_output=True, text=True)
     assert done.returncode in ends, f"{' '.join(map(str, words))}:\n{done.stdout}\n{done.stderr}"
