@@ -21,7 +21,7 @@ from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
-from hsnoise.statistics.pixels.oddities import lit_darks, oddities_of, pixels_apart
+from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
@@ -43,6 +43,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
+    grave += [] if result.transfer is not None else moved_frames(found)
     share = _outlier_share(result)
     alone = tuple(_by_shape_alone(result))
     grave += alone if is_extraordinary(result) else ()
@@ -52,6 +53,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *order_note(result),
         *pixels_apart(found),
         *lit_darks(found),
+        *moved_frames(found),
         *_outliers(result),
         *_moved_pedestals(result),
         *_many_hot(result),

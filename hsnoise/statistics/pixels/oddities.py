@@ -17,39 +17,72 @@ QUIET = 0.05  # of the other colours' noise: below it a colour is dead
 LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel's noise
 LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # relative, of that signal over pixels: less is simulated, more is dark current
 SMOOTHED = 0.1  # share of the noise that neighbouring pixels have in common
+LIT = 1.0  # in units of a pixel's noise: a larger shift of a frame is not a wandering black level
 FEWEST = 3  # frames among which an odd one can be found
 
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
     """What is wrong with frames, rows, columns and colours, most important first."""
-    return (*_frames(found), *_lines(found), *_colours(found), *_smoothed(found))
+    return (*_lit_frames(found), *_averages(found), *_lines(found), *_colours(found), *_smoothed(found))
 
 
 def name_of(group: Group) -> str:
     return f"{group.kind} frames of {group.exposure_s:g} s"
 
 
-def _frames(found: Survey) -> Iterator[str]:
-    for group in found.groups:
+def _called(group: Group, f: int) -> str:
+    return f"{group.files[f]} ({name_of(group)})" if group.files else f"Frame {f} of the {name_of(group)}"
+
+
+def _lit_frames(found: Survey) -> Iterator[str]:
+    for group, f, off in _odd_levels(found):
+        if abs(off) > LIT * group.noise_dn:
+            yield (
+                f"{_called(group, f)} is {abs(off):.3g} DN {_side(off)} than the others: is it lit, or taken at another"
+                " exposure or temperature? Leave it out."
+            )
+
+
+def moved_frames(found: Survey) -> Iterator[str]:
+    """Frames whose black level is another, by less than the noise of a pixel: nothing where frames are followed."""
+    for group, f, off in _odd_levels(found):
+        if abs(off) <= LIT * group.noise_dn:
+            why = "settles after a pause" if f == 0 else "jumps"
+            yield f"{_called(group, f)} is {abs(off):.3g} DN {_side(off)} than the others: the black level {why}."
+
+
+def _side(off: float) -> str:
+    return "brighter" if off > 0 else "darker"
+
+
+def _odd_levels(found: Survey) -> Iterator[tuple[Group, int, float]]:
+    """Dark frames whose level is far from that of the others, DN; flicker is removed from flats."""
+    for group in found.darks:
         if group.n_frames < FEWEST:
             continue
         level = np.mean([p.halves.frame_means_dn for p in group.planes], axis=0)
-        noise = np.mean([p.halves.frame_noise_dn for p in group.planes], axis=0)
         off = level - np.median(level)
         scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
+        pixel = float(np.median(_noise_of_frames(group)))
+        for f in np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
+            yield group, int(f), float(off[f])
+
+
+def _averages(found: Survey) -> Iterator[str]:
+    for group in found.groups:
+        if group.n_frames < FEWEST:
+            continue
+        noise = _noise_of_frames(group)
         pixel = float(np.median(noise))
-        lit = group.kind == "flat"  # flicker is removed from flats
-        for f in () if lit else np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
-            side = "brighter" if off[f] > 0 else "darker"
-            yield (
-                f"Frame {f} of the {name_of(group)} is {abs(off[f]):.3g} DN {side} than the others: is it lit, or"
-                " taken at another exposure or temperature? Leave it out."
-            )
         for f in np.flatnonzero(noise < (1 - ODD_NOISE) * pixel):
             yield (
-                f"Frame {f} of the {name_of(group)} has {1 - noise[f] / pixel:.0%} less noise than the others: is it an"
+                f"{_called(group, int(f))} has {1 - noise[f] / pixel:.0%} less noise than the others: is it an"
                 " average of frames (a masterdark)? Leave it out."
             )
+
+
+def _noise_of_frames(group: Group) -> np.ndarray:
+    return np.mean([p.halves.frame_noise_dn for p in group.planes], axis=0)
 
 
 def _lines(found: Survey) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ class Group:
     """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes.
 
     along: what pixels share of their temporal noise along rows; None if the frames do not show it.
+    files: names of the frames' files; empty for arrays.
     """
 
     exposure_s: float
@@ -71,6 +73,7 @@ class Group:
     odd_lines: OddLines
     planes: tuple[Plane, ...]
     along: Along | None
+    files: tuple[str, ...]
 
     def of(self, channel: int) -> list[Plane]:
         """The planes of one channel."""
@@ -178,8 +181,8 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
     )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
-    along = along_rows(kept, step)
-    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, along), highest
+    of_frames = along_rows(kept, step), tuple(Path(name).name for name in getattr(stack.counts[i], "names", ()))
+    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest
 
 
 def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
