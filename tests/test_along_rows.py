@@ -10,7 +10,7 @@ from hsnoise import effects as fx
 from hsnoise.fitting.problem import Problem
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
-from hsnoise.statistics.pixels.along_rows import along_rows, of_read_noise
+from hsnoise.statistics.pixels.along_rows import along_rows, of_read_noise, of_the_signal
 
 READ_DN2 = (12.0 * 0.5) ** 2
 
@@ -40,6 +40,39 @@ def test_a_part_of_the_read_noise_is_found_with_its_size(frequency, memory):
 def test_what_acts_on_the_signal_or_on_rows_is_not_read_noise(effect):
     for exposure_s in ((0.0, 60.0), (0.0,)):
         assert of_read_noise(groups(drawn(effect, exposure_s)), READ_DN2) is None
+
+
+@pytest.mark.parametrize("effect", [fx.ReadoutBandwidth(0.06), fx.ReadoutOvershoot(0.06), fx.FrameOffset(0.0)])
+def test_a_coupled_signal_is_doubted_with_the_error_of_its_gain(effect):
+    stack = drawn(effect, (0.0, 20.0, 60.0), more=(fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)))
+    own = getattr(effect, "fraction", 0.0) * (-1 if effect.name == "readout_overshoot" else 1)
+    shared = own * (1 - own) / ((1 - own) ** 2 + own**2)
+    assert abs(of_the_signal(groups(stack)) - shared) < 0.03
+    result = hsnoise.fit(stack)
+    told = [doubt for doubt in result.doubts if "of their shot noise" in doubt]
+    assert bool(told) == (own != 0) and result.grave >= bool(told)
+    if told:
+        stated = float(told[0].rpartition("by up to ")[2].partition("%")[0]) / 100
+        assert ("too large" in told[0]) == (own < 0) and abs(stated - 2 * abs(shared)) < 0.05
+
+
+@pytest.mark.parametrize(("frequency", "memory"), [(0.0, 0.5), (0.0, 0.8), (0.5, 0.4)])
+def test_it_does_not_pass_for_row_noise_or_for_smoothing(frequency, memory):
+    hot = fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)
+    result = hsnoise.fit(drawn(fx.CorrelatedReadNoise(0.3, frequency, memory), (0.0, 20.0, 60.0), more=hot))
+    assert "correlated_read_noise" in result.added and "row_noise" not in result.added
+    assert not any("smoothed" in doubt for doubt in result.doubts)
+
+
+def test_tracks_of_particles_are_no_correlated_read_noise():
+    counts = np.stack(list(drawn(fx.FrameOffset(0.0), (0.0,)).frames(0)))
+    rng = np.random.default_rng(8)
+    for frame in counts:
+        for _ in range(15):
+            r, c = rng.integers(0, 180), rng.integers(0, 240)
+            track = np.arange(12)
+            frame[r + track // 2, c + track] += rng.exponential(60.0, 12).astype(np.uint16)
+    assert of_read_noise([along_rows(counts, 1)], READ_DN2) is None
 
 
 def test_bias_frames_alone_show_it_where_it_reaches_two_pixels_far():

@@ -86,7 +86,8 @@ def _fit_arguments(commands: Any) -> None:
     fit.add_argument("paths", nargs="+", metavar="PATH", help="dark frames: a folder, files or a pattern in quotes")
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
     fit.add_argument(
-        "--model", help="model.json whose effects are fitted, such as that of `improve` (default: the paper's model)"
+        "--model",
+        help="model.json whose effects are fitted, such as that of `improve` (default: the paper's, and what pixels show)",
     )
     _method_argument(fit)
     fit.add_argument(

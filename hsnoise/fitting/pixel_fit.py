@@ -18,8 +18,9 @@ from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.decomposition import mean_of
-from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise
+from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
+from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.read_noise import read_noise_spread
 from hsnoise.statistics.pixels.sample import without_outliers
@@ -61,6 +62,7 @@ class Channel:
         noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
+        rays: hits of single frames; None if there are none.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Channel:
     noise_spread: tuple[float, float]
     photo_response: tuple[float, float]
     warm: Warm | None
+    rays: Rays | None
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,8 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
     read_dn2 = float(np.mean([max(one.values[1] - ROUNDING, ROUNDING) for one in channels]))
     ringing = of_read_noise([group.along for group in found.groups if group.along is not None], read_dn2)
+    if ringing is not None:
+        channels = [_without_rows_of(ringing, one, _shortest(found, c)) for c, one in enumerate(channels)]
     return PixelFit(tuple(channels), flats, ringing, estimate, covariance, bool(known.all()))
 
 
@@ -151,7 +156,23 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         noise_spread=read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
+        rays=_rays(found, c) if narrow is None else None,
     )
+
+
+def _rays(found: Survey, c: int) -> Rays | None:
+    """Hits of single dark frames."""
+    of = [(group.exposure_s, p.halves.hits) for group in found.repeated_darks for p in group.of(c)]
+    return rays_of([(t, hits) for t, hits in of if hits is not None])
+
+
+def _without_rows_of(ringing: Ringing, channel: Channel, planes: list[Plane]) -> Channel:
+    """The channel without the row noise that correlated read noise makes."""
+    step = 1 if channel.name == "mono" else 2
+    columns = len(planes[0].column_mean_dn) if planes else 1
+    extra = shared_by_row(ringing, columns, step) * max(channel.values[1] - ROUNDING, 0.0)
+    variance, *errors = channel.patterns["row_noise"]
+    return replace(channel, patterns={**channel.patterns, "row_noise": (variance - extra, *errors)})
 
 
 def _warm(found: Survey, c: int) -> Warm | None:

@@ -15,6 +15,7 @@ from hsnoise.effects import (
     ColumnFixedPattern,
     ColumnNoise,
     CorrelatedReadNoise,
+    CosmicRays,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     FrameOffset,
@@ -54,6 +55,7 @@ OF_PIXELS = (
     ColumnNoise,
     BlackShading,
     CorrelatedReadNoise,
+    CosmicRays,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -154,6 +156,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     noise_spread = _mean([c.noise_spread for c in pixel.channels])
     if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
         found["read_noise_nonuniformity"] = {"spread": noise_spread}
+    found |= _rays(pixel, gain)
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
     response = _mean([c.photo_response for c in pixel.channels])
@@ -212,6 +215,16 @@ def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict
     if longest_s > 0:
         return {"hot_pixels": {**hot, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
     return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}
+
+
+def _rays(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """Cosmic rays, if all colours have hits of single frames: means over the colours."""
+    told = [(c.rays, g) for c, g in zip(pixel.channels, gain, strict=True) if c.rays is not None]
+    if len(told) < len(pixel.channels):
+        return {}
+    charge = _mean([(rays.charge_dn[0] / g, rays.charge_dn[1] / g) for rays, g in told])
+    rate, at_readout = (_mean([of[i] for of, _ in told]) for i in (0, 2))
+    return {"cosmic_rays": {"rate": rate, "charge": charge, "at_readout": at_readout}}
 
 
 def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:

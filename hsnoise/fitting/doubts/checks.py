@@ -21,7 +21,7 @@ from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
-from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart
+from hsnoise.statistics.pixels.oddities import coupled, lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
@@ -33,6 +33,7 @@ ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks 
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
+COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
 MANY_HOT = 0.15  # share of pixels
 STATIC_SHARE = 0.03  # static variance that a pooled fit mistakes for noise, over the temporal variance
 
@@ -44,6 +45,9 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
     grave += [] if result.transfer is not None else moved_frames(found)
+    grave += [] if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
+    of_signal = tuple(_coupled(found))
+    grave += of_signal if abs(coupled(found)) > MOST_COUPLED else ()
     share = _outlier_share(result)
     alone = tuple(_by_shape_alone(result))
     grave += alone if is_extraordinary(result) else ()
@@ -52,6 +56,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found),
+        *of_signal,
         *lit_darks(found),
         *moved_frames(found),
         *_outliers(result),
@@ -131,6 +136,17 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
             )
     if pixel.flats is not None:
         yield from _flats_against_darks(pixel)
+
+
+def _coupled(found: Survey) -> Iterator[str]:
+    """Shot noise that neighbours share: a pixel's variance is then no measure of its electrons."""
+    excess = coupled(found)
+    if abs(excess) > COUPLED:
+        yield (
+            f"Neighbours along a row share {-excess / 2:+.1%} of their shot noise: the signal is coupled (hsnoise"
+            f" diagnose may name it), and the gain comes out too {'large' if excess > 0 else 'small'} by up to"
+            f" {abs(excess):.0%}."
+        )
 
 
 def _moved_pedestals(result: FitResult) -> Iterator[str]:

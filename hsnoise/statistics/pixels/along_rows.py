@@ -6,16 +6,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS
 
 NEAR, FAR = np.arange(1, 5), np.arange(9, 17)  # pixels apart: what is measured, and what is common to a row
 MOST_PAIRS, MOST_PIXELS = 4, 1 << 20  # of frames, and of one frame
+BESIDE = 2  # pixels beside an outlier that are left out with it
 NARROWEST = 1.0  # DN: rounding correlates what is narrower
 ALIKE = 1.15  # factor of the least variance up to which groups have hardly anything but read noise
 FAR_BETTER = 2.0  # chi-square by which an explanation fails more than the other
 THERE = 50.0  # chi-square of four correlations by chance: 20 in one of two thousand
 FARTHER = 0.2  # of the covariance of neighbours, with the next pixel but one: none acts on the signal so far
+SIGNIFICANT = 5.0  # standard errors of a correlation of shot noise
 LEAST_SHARE = 0.005  # of the read noise; less hardly shows
 SIMPLER = 2.0  # factor by which the chi-square of a frequency between slow and alternating must be less
 # With less memory than that, only the product of share and memory would show.
@@ -62,8 +65,13 @@ def _bounded(change: np.ndarray, colours: int) -> np.ndarray:
         part = change[:, first::colours]
         part -= np.median(part, axis=1, keepdims=True)
     change -= np.median(change, axis=0)
-    width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
-    return np.clip(change, -width, width)
+    far = np.abs(change) > CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
+    near = far.copy()
+    for step in range(1, BESIDE + 1):  # tracks of particles are as faint at their ends as noise
+        near[:, step:] |= far[:, :-step]
+        near[:, :-step] |= far[:, step:]
+    change[near] = 0.0
+    return change
 
 
 def _product(x: np.ndarray, lag: int) -> float:
@@ -76,55 +84,89 @@ def of_read_noise(groups: Sequence[Along], read_dn2: float) -> Ringing | None:
     What acts on the signal, such as an amplifier that has not settled, correlates shot noise as much, and reaches one
     pixel far. Where no group has shot noise, and nothing reaches farther, the two cannot be separated: None.
     """
-    least = min((one.variance_dn2 for one in groups), default=0.0)
-    quiet = [one for one in groups if one.variance_dn2 < ALIKE * least]
-    noisy = [one for one in groups if one.variance_dn2 >= ALIKE * least]
-    if not quiet:
-        return None
-    weight = np.array([one.error_dn2**-2.0 for one in quiet])
-    covariance = np.average([one.covariance_dn2 for one in quiet], 0, weight)
-    variance, error = float(np.average([one.variance_dn2 for one in quiet], 0, weight)), float(weight.sum() ** -0.5)
-    if float(np.sum(covariance**2)) < THERE * error**2:
+    quiet, noisy = _by_noise(groups)
+    if quiet is None or float(np.sum(quiet.covariance_dn2**2)) < THERE * quiet.error_dn2**2:
         return None
     if noisy:
-        same, growing = (_left(noisy, covariance, error, of) for of in (0.0, 1 / variance))
-        of_signal = growing < FAR_BETTER * same + THERE
+        of_signal = _left(noisy, quiet, grows=True) < FAR_BETTER * _left(noisy, quiet, grows=False) + THERE
     else:
-        next_but_one = abs(covariance[1])
-        of_signal = next_but_one < FARTHER * abs(covariance[0]) or next_but_one**2 < THERE * error**2
-    return None if of_signal else _ringing(covariance / read_dn2, error / read_dn2)
+        near, farther = np.abs(quiet.covariance_dn2[:2])
+        of_signal = farther < FARTHER * near or farther**2 < THERE * quiet.error_dn2**2
+    return None if of_signal else _ringing(quiet.covariance_dn2 / read_dn2, quiet.error_dn2 / read_dn2)
 
 
-def _left(groups: Sequence[Along], covariance: np.ndarray, error: float, per_dn2: float) -> float:
-    """Chi-square of groups if their covariance is that of quiet ones, or (per_dn2 > 0) grows with the variance."""
+def of_the_signal(groups: Sequence[Along]) -> float:
+    """Correlation of neighbours that their shot noise has, too, so that the signal is coupled; 0 if it is not."""
+    if not _by_noise(groups)[1]:
+        return 0.0
+    variance, error = (np.array([one[i] for one in groups]) for i in (0, 2))
+    shared = np.array([one.covariance_dn2[0] for one in groups])
+    # What the read noise adds stays as it is: the slope is that of the shot noise.
+    design = np.stack([np.ones(len(groups)), variance], 1) / error[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    value = float((covariance @ design.T @ (shared / error))[1])
+    return value if value**2 > SIGNIFICANT**2 * covariance[1, 1] else 0.0
+
+
+def _by_noise(groups: Sequence[Along]) -> tuple[Along | None, list[Along]]:
+    """The mean of the groups that have hardly anything but read noise, and the others."""
+    least = min((one.variance_dn2 for one in groups), default=0.0)
+    quiet = [one for one in groups if one.variance_dn2 < ALIKE * least]
+    if not quiet:
+        return None, []
+    weight = np.array([one.error_dn2**-2.0 for one in quiet])
+    variance, covariance = (np.average([one[i] for one in quiet], 0, weight) for i in (0, 1))
+    mean = Along(float(variance), covariance, float(weight.sum() ** -0.5))
+    return mean, [one for one in groups if one.variance_dn2 >= ALIKE * least]
+
+
+def _left(groups: Sequence[Along], quiet: Along, *, grows: bool) -> float:
+    """Chi-square of groups if their covariance is that of quiet ones, or grows with the variance."""
     left = 0.0
     for one in groups:
-        growth = one.variance_dn2 * per_dn2 if per_dn2 > 0 else 1.0
-        off = one.covariance_dn2 - growth * covariance
-        left += float(np.sum(off**2)) / (one.error_dn2**2 + (growth * error) ** 2)
+        growth = one.variance_dn2 / quiet.variance_dn2 if grows else 1.0
+        off = one.covariance_dn2 - growth * quiet.covariance_dn2
+        left += float(np.sum(off**2)) / (one.error_dn2**2 + (growth * quiet.error_dn2) ** 2)
     return left
 
 
 def _ringing(correlation: np.ndarray, error: float) -> Ringing | None:
     """Share, frequency and memory of correlations at NEAR lags, by least squares; None if the share is negligible."""
-    shape = MEMORIES[:, None, None] ** NEAR * np.cos(2 * np.pi * FREQUENCIES[:, None] * NEAR)
+    shape = _shape(FREQUENCIES[:, None], MEMORIES[:, None, None])
     share = np.clip((shape @ correlation) / np.sum(shape**2, -1), 0.0, 1.0)
-    left = np.sum((correlation - share[..., None] * shape) ** 2, -1) / error**2
+    left = np.sum((correlation - share[..., None] * shape) ** 2, -1)
     left[:, 1:-1] *= SIMPLER
     m, f = np.unravel_index(int(left.argmin()), left.shape)
     if share[m, f] * MEMORIES[m] < LEAST_SHARE:
         return None
-    found = np.array([share[m, f], FREQUENCIES[f], MEMORIES[m]])
     between = 0 < f < len(FREQUENCIES) - 1
-    free = [0, 1, 2] if between else [0, 2]
-    slopes = np.array([_correlations(found + step) - _correlations(found - step) for step in 1e-4 * np.eye(3)[free]])
-    information = slopes @ slopes.T / (2e-4 * error) ** 2 + 1e-6 * np.eye(len(free))
-    errors = np.zeros(3)
-    errors[free] = np.sqrt(np.diagonal(np.linalg.inv(information)))
-    return Ringing(*((float(value), float(one)) for value, one in zip(found, errors, strict=True)))
+    start, low, high = np.array([share[m, f], MEMORIES[m], FREQUENCIES[f]]), [0.0, MEMORIES[0], 0.0], [1.0, 0.99, 0.5]
+    free = slice(None) if between else slice(0, 2)
+
+    def off(some: np.ndarray) -> np.ndarray:
+        share, memory, *frequency = some
+        return (share * _shape(frequency[0] if between else start[2], memory) - correlation) / error
+
+    bounds = np.array(low)[free], np.array(high)[free]
+    found = least_squares(off, np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6), bounds=bounds, x_scale=0.1)
+    n = len(found.x)
+    worse = max(1.0, 2 * found.cost / (len(NEAR) - n))  # one ringing does not describe every amplifier
+    inside = found.active_mask == 0  # a memory at its bound is held there
+    jac, errors = found.jac[:, inside], np.zeros(n)
+    errors[inside] = np.sqrt(worse * np.diagonal(np.linalg.inv(jac.T @ jac + 1e-6 * np.eye(jac.shape[1]))))
+    pairs = [(float(value), float(one)) for value, one in zip(found.x, errors, strict=True)]
+    return Ringing(share=pairs[0], frequency=pairs[2] if between else (float(start[2]), 0.0), memory=pairs[1])
 
 
-def _correlations(values: np.ndarray) -> np.ndarray:
-    """At NEAR lags, for (share, frequency, memory)."""
-    share, frequency, memory = values
-    return share * memory**NEAR * np.cos(2 * np.pi * frequency * NEAR)
+def _shape(frequency: np.ndarray | float, memory: np.ndarray | float) -> np.ndarray:
+    """Correlation at NEAR lags of a ringing [..., lag], less its own part of what FAR lags have in common."""
+    near, far = (memory**lags * np.cos(2 * np.pi * frequency * lags) for lags in (NEAR, FAR))
+    common = np.stack([far[..., lag % 2 == FAR % 2].mean(-1) for lag in NEAR], -1)
+    return near - common
+
+
+def shared_by_row(of: Ringing, columns: int, step: int) -> float:
+    """What the mean of every `step`-th pixel of a row varies more than independent pixels, over the read variance."""
+    lags = step * np.arange(1, columns)
+    together = of.memory[0] ** lags * np.cos(2 * np.pi * of.frequency[0] * lags) * (1 - lags / (step * columns))
+    return 2 * of.share[0] * float(np.sum(together)) / columns

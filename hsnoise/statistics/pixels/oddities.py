@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hsnoise._core.naming import setting
+from hsnoise.statistics.pixels.along_rows import of_the_signal
 from hsnoise.statistics.pixels.flags import counts_of, flags_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -23,7 +24,7 @@ FEWEST = 3  # frames among which an odd one can be found
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
     """What is wrong with frames, rows, columns and colours, most important first."""
-    return (*_lit_frames(found), *_averages(found), *_lines(found), *_colours(found), *_smoothed(found))
+    return (*_lit_frames(found), *_averages(found), *_lines(found), *_colours(found))
 
 
 def name_of(group: Group) -> str:
@@ -115,7 +116,7 @@ def _colours(found: Survey) -> Iterator[str]:
                 yield f"The colour {name} has no noise ({noise[c]:.2g} DN²): its channel is dead, or padding."
 
 
-def _smoothed(found: Survey) -> Iterator[str]:
+def smoothed(found: Survey) -> Iterator[str]:
     """Noise that neighbours share: a pixel's variance is then no measure of its electrons."""
     # Darks only: if light differs between two flats, their pattern changes, too.
     planes = [(plane.neighbours_share, group) for group in found.repeated_darks for plane in group.planes]
@@ -126,6 +127,11 @@ def _smoothed(found: Survey) -> Iterator[str]:
             f"Neighbouring pixels of a row share {share:.0%} of their noise ({name_of(group)}): the frames were"
             " smoothed, denoised, resized or demosaiced, or the readout is slow. Gain and noise come out too small."
         )
+
+
+def coupled(found: Survey) -> float:
+    """By how much a gain comes out too large, relative, because neighbours along rows share shot noise; 0 if not."""
+    return -2 * of_the_signal([group.along for group in found.groups if group.along is not None])
 
 
 def lit_darks(found: Survey) -> Iterator[str]:

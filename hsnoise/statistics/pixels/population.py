@@ -218,6 +218,8 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     values = np.array(natural(theta))
     units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3], values[4]])
     errors = np.append(_errors(loss, theta), np.full(5 - len(theta), np.inf)) * np.where(units > 0, units, 1.0)
+    if len(theta) > 4 and theta[4] >= MOST_TAIL:
+        errors[4] = 0.0  # held there
     if theta is cool:
         values[2:], errors[2:] = 0.0, np.inf
     alike = theta.copy()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise.statistics.apart import typical_offset
+from hsnoise.statistics.pixels.hits import Hits, hits_of
 
 MOST_PIXELS = 1 << 21  # sampled pixels of an exposure
 MOST_OF_ALL = 1 << 22  # of all exposures together
@@ -42,6 +43,7 @@ class Halves:
         frame_means_dn [frame]: level of each frame relative to the typical one, DN.
         pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
         frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
+        hits: pixels far above their level in one frame; None of too few frames.
     """
 
     n_frames: tuple[int, int]
@@ -53,6 +55,7 @@ class Halves:
     frame_means_dn: np.ndarray
     pair_variance_dn2: np.ndarray
     frame_noise_dn: np.ndarray
+    hits: Hits | None
 
 
 def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
@@ -84,7 +87,7 @@ def halves_of(counts: np.ndarray) -> Halves:
     whole = flat.var(0, ddof=1) - added
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
     frames = len(flat[::2]), len(flat[1::2])
-    return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise)
+    return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise, hits_of(flat))
 
 
 def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
