@@ -87,7 +87,7 @@ def _fit_arguments(commands: Any) -> None:
     fit.add_argument("--out", type=Path, default=Path("hsnoise-fit"), metavar="FOLDER", help="default: hsnoise-fit")
     fit.add_argument(
         "--model",
-        help="model.json whose effects are fitted, such as that of `improve` (default: the paper's, and what pixels show)",
+        help="model.json whose effects are fitted, such as that of `improve` (default: the paper's, and what is found)",
     )
     _method_argument(fit)
     fit.add_argument(
