@@ -10,7 +10,7 @@ from hsnoise import effects as fx
 from hsnoise.fitting.problem import Problem
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
-from hsnoise.statistics.pixels.along_rows import along_rows, of_read_noise, of_the_signal
+from hsnoise.statistics.pixels.along_rows import Along, along_rows, of_read_noise, of_the_signal
 
 READ_DN2 = (12.0 * 0.5) ** 2
 
@@ -73,6 +73,12 @@ def test_tracks_of_particles_are_no_correlated_read_noise():
             track = np.arange(12)
             frame[r + track // 2, c + track] += rng.exponential(60.0, 12).astype(np.uint16)
     assert of_read_noise([along_rows(counts, 1)], READ_DN2) is None
+
+
+def test_correlations_that_are_no_ringing_are_left_alone():
+    ccd = Along(281.1, np.array([-48.8, 37.6, 18.6, 6.6]), 0.6)  # bias frames of a SITe 2k
+    assert of_read_noise([ccd], 281.0) is None
+    assert of_read_noise([ccd._replace(covariance_dn2=np.array([-48.8, 17.6, -6.6, 2.6]))], 281.0) is not None
 
 
 def test_bias_frames_alone_show_it_where_it_reaches_two_pixels_far():

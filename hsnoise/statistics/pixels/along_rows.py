@@ -20,6 +20,7 @@ THERE = 50.0  # chi-square of four correlations by chance: 20 in one of two thou
 FARTHER = 0.2  # of the covariance of neighbours, with the next pixel but one: none acts on the signal so far
 SIGNIFICANT = 5.0  # standard errors of a correlation of shot noise
 LEAST_SHARE = 0.005  # of the read noise; less hardly shows
+MOST_LEFT = 0.2  # of the squares of the correlations, by a ringing that describes them
 SIMPLER = 2.0  # factor by which the chi-square of a frequency between slow and alternating must be less
 # With less memory than that, only the product of share and memory would show.
 FREQUENCIES, MEMORIES = np.linspace(0.0, 0.5, 51), np.linspace(0.2, 0.95, 76)
@@ -131,13 +132,17 @@ def _left(groups: Sequence[Along], quiet: Along, *, grows: bool) -> float:
 
 
 def _ringing(correlation: np.ndarray, error: float) -> Ringing | None:
-    """Share, frequency and memory of correlations at NEAR lags, by least squares; None if the share is negligible."""
+    """Share, frequency and memory of correlations at NEAR lags, by least squares.
+
+    None if the share is negligible, or one ringing does not describe them.
+    """
     shape = _shape(FREQUENCIES[:, None], MEMORIES[:, None, None])
     share = np.clip((shape @ correlation) / np.sum(shape**2, -1), 0.0, 1.0)
     left = np.sum((correlation - share[..., None] * shape) ** 2, -1)
     left[:, 1:-1] *= SIMPLER
     m, f = np.unravel_index(int(left.argmin()), left.shape)
-    if share[m, f] * MEMORIES[m] < LEAST_SHARE:
+    best = float(np.sum((correlation - share[m, f] * shape[m, f]) ** 2))
+    if share[m, f] * MEMORIES[m] < LEAST_SHARE or best > MOST_LEFT * float(np.sum(correlation**2)):
         return None
     between = 0 < f < len(FREQUENCIES) - 1
     start, low, high = np.array([share[m, f], MEMORIES[m], FREQUENCIES[f]]), [0.0, MEMORIES[0], 0.0], [1.0, 0.99, 0.5]
