@@ -42,7 +42,13 @@ def test_what_acts_on_the_signal_or_on_rows_is_not_read_noise(effect):
         assert of_read_noise(groups(drawn(effect, exposure_s)), READ_DN2) is None
 
 
-@pytest.mark.parametrize("effect", [fx.ReadoutBandwidth(0.06), fx.ReadoutOvershoot(0.06), fx.FrameOffset(0.0)])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        fx.ReadoutBandwidth(0.06),
+        *(pytest.param(one, marks=pytest.mark.slow) for one in (fx.ReadoutOvershoot(0.06), fx.FrameOffset(0.0))),
+    ],
+)
 def test_a_coupled_signal_is_doubted_with_the_error_of_its_gain(effect):
     stack = drawn(effect, (0.0, 20.0, 60.0), more=(fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)))
     own = getattr(effect, "fraction", 0.0) * (-1 if effect.name == "readout_overshoot" else 1)
@@ -56,7 +62,10 @@ def test_a_coupled_signal_is_doubted_with_the_error_of_its_gain(effect):
         assert ("too large" in told[0]) == (own < 0) and abs(stated - 2 * abs(shared)) < 0.05
 
 
-@pytest.mark.parametrize(("frequency", "memory"), [(0.0, 0.5), (0.0, 0.8), (0.5, 0.4)])
+@pytest.mark.parametrize(
+    ("frequency", "memory"),
+    [(0.0, 0.5), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((0.0, 0.8), (0.5, 0.4)))],
+)
 def test_it_does_not_pass_for_row_noise_or_for_smoothing(frequency, memory):
     hot = fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)
     result = hsnoise.fit(drawn(fx.CorrelatedReadNoise(0.3, frequency, memory), (0.0, 20.0, 60.0), more=hot))
@@ -113,7 +122,12 @@ def test_a_fit_adds_it_and_keeps_gain_and_read_noise():
 
 
 @pytest.mark.parametrize(
-    ("extra", "held"), [(fx.RowNoise(2.0), True), (fx.CosmicRays(2.0, 500.0), True), (fx.Crosstalk(0.02), False)]
+    ("extra", "held"),
+    [
+        (fx.RowNoise(2.0), True),
+        pytest.param(fx.CosmicRays(2.0, 500.0), True, marks=pytest.mark.slow),
+        (fx.Crosstalk(0.02), False),
+    ],
 )
 def test_a_refit_holds_a_gain_of_pixels_over_time_unless_the_signal_is_changed(extra, held):
     stack = drawn(fx.HotPixels(0.02, 20.0), (0.0, 20.0, 60.0), more=(fx.DarkCurrentNonuniformity(0.3),))
