@@ -89,7 +89,8 @@ def of_read_noise(groups: Sequence[Along], read_dn2: float) -> Ringing | None:
     if quiet is None or float(np.sum(quiet.covariance_dn2**2)) < THERE * quiet.error_dn2**2:
         return None
     if noisy:
-        of_signal = _left(noisy, quiet, grows=True) < FAR_BETTER * _left(noisy, quiet, grows=False) + THERE
+        same, growing = (_left(noisy, quiet, grows=grows) for grows in (False, True))
+        of_signal = growing < max(FAR_BETTER * same, same + THERE)
     else:
         near, farther = np.abs(quiet.covariance_dn2[:2])
         of_signal = farther < FARTHER * near or farther**2 < THERE * quiet.error_dn2**2
