@@ -66,7 +66,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
     if result.method == Method.TRANSFER:
-        notes = (*pixel_notes(result), *_of_narrow(result, found), *_of_flats(result))
+        notes = (*pixel_notes(result), *_of_neighbours(result), *_of_narrow(result, found), *_of_flats(result))
     notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
 
@@ -255,6 +255,17 @@ def _outliers(result: FitResult) -> Iterator[str]:
 def _of_flats(result: FitResult) -> list[str]:
     flats = result.transfer.flats
     return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
+
+
+def _of_neighbours(result: FitResult) -> Iterator[str]:
+    """What correlated read noise means for neighbours."""
+    ringing = result.transfer.ringing if result.transfer is not None else None
+    if ringing is not None and "correlated_read_noise" in result.params:
+        share = ringing.share[0] * ringing.memory[0] * np.cos(2 * np.pi * ringing.frequency[0])
+        yield (
+            f"Neighbours along a row share {share:+.1%} of the variance of the read noise, but not of the shot noise"
+            " (correlated_read_noise)."
+        )
 
 
 def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
