@@ -110,6 +110,22 @@ def test_frames_that_cannot_show_it_give_nothing(counts):
     assert along_rows(counts.astype(np.uint16), 1) is None
 
 
+def test_flats_beside_single_darks_do_not_show_it():
+    """Without repeated darks nobody knows how large the read noise is, of which it is a share."""
+    camera = [fx.ShotNoise(), fx.ReadNoise(30.0), fx.Gain(0.5), fx.BlackLevel(900.0), fx.ADC(None)]
+    model = hsnoise.NoiseModel(
+        [*camera, fx.CorrelatedReadNoise(0.5, 0.5, 0.6)], cfa="mono", shutter="rolling", exposure_s=1.0
+    )
+    light = (0.0, 30.0, 400.0, 2000.0)
+    counts = [
+        np.asarray(hsnoise.sample(i, np.full((1 if i == 0 else 6, 120, 256), x), model, sensor_key=1))
+        for i, x in enumerate(light)
+    ]
+    kinds = ["dark", *["flat"] * 3]
+    result = hsnoise.fit(hsnoise.FrameStack(counts, [1.0] * 4, kind=kinds), method="transfer")
+    assert result.transfer is not None and result.transfer.ringing is None
+
+
 def test_a_fit_adds_it_and_keeps_gain_and_read_noise():
     hot = fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)
     stack = drawn(fx.CorrelatedReadNoise(0.3, 0.5, 0.4), (0.0, 20.0, 60.0), more=hot)

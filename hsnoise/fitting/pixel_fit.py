@@ -110,7 +110,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
     known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
     read_dn2 = float(np.mean([max(one.values[1] - ROUNDING, ROUNDING) for one in channels]))
-    ringing = of_read_noise([group.along for group in found.groups if group.along is not None], read_dn2)
+    ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, _shortest(found, c)) for c, one in enumerate(channels)]
     return PixelFit(tuple(channels), flats, ringing, estimate, covariance, bool(known.all()))
@@ -169,8 +169,7 @@ def _rays(found: Survey, c: int) -> Rays | None:
 def _without_rows_of(ringing: Ringing, channel: Channel, planes: list[Plane]) -> Channel:
     """The channel without the row noise that correlated read noise makes."""
     step = 1 if channel.name == "mono" else 2
-    columns = len(planes[0].column_mean_dn) if planes else 1
-    extra = shared_by_row(ringing, columns, step) * max(channel.values[1] - ROUNDING, 0.0)
+    extra = shared_by_row(ringing, len(planes[0].column_mean_dn), step) * max(channel.values[1] - ROUNDING, 0.0)
     variance, *errors = channel.patterns["row_noise"]
     return replace(channel, patterns={**channel.patterns, "row_noise": (variance - extra, *errors)})
 

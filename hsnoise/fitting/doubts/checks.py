@@ -21,7 +21,8 @@ from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
-from hsnoise.statistics.pixels.oddities import coupled, lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
+from hsnoise.statistics.pixels.along_rows import of_the_signal
+from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
@@ -44,10 +45,11 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
-    grave += [] if result.transfer is not None else moved_frames(found)
-    grave += [] if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
-    of_signal = tuple(_coupled(found))
-    grave += of_signal if abs(coupled(found)) > MOST_COUPLED else ()
+    moved, excess = tuple(moved_frames(found)), -2 * of_the_signal(found.along)
+    grave += moved if result.transfer is None else ()
+    grave += () if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
+    of_signal = tuple(_coupled(excess))
+    grave += of_signal if abs(excess) > MOST_COUPLED else ()
     share = _outlier_share(result)
     alone = tuple(_by_shape_alone(result))
     grave += alone if is_extraordinary(result) else ()
@@ -58,7 +60,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *pixels_apart(found),
         *of_signal,
         *lit_darks(found),
-        *moved_frames(found),
+        *moved,
         *_outliers(result),
         *_moved_pedestals(result),
         *_many_hot(result),
@@ -138,9 +140,11 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
         yield from _flats_against_darks(pixel)
 
 
-def _coupled(found: Survey) -> Iterator[str]:
-    """Shot noise that neighbours share: a pixel's variance is then no measure of its electrons."""
-    excess = coupled(found)
+def _coupled(excess: float) -> Iterator[str]:
+    """Shot noise that neighbours share: a pixel's variance is then no measure of its electrons.
+
+    excess: by how much the gain comes out too large, relative.
+    """
     if abs(excess) > COUPLED:
         yield (
             f"Neighbours along a row share {-excess / 2:+.1%} of their shot noise: the signal is coupled (hsnoise"

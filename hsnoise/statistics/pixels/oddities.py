@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from hsnoise._core.naming import setting
-from hsnoise.statistics.pixels.along_rows import of_the_signal
 from hsnoise.statistics.pixels.flags import counts_of, flags_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -127,11 +126,6 @@ def smoothed(found: Survey) -> Iterator[str]:
             f"Neighbouring pixels of a row share {share:.0%} of their noise ({name_of(group)}): the frames were"
             " smoothed, denoised, resized or demosaiced, or the readout is slow. Gain and noise come out too small."
         )
-
-
-def coupled(found: Survey) -> float:
-    """By how much a gain comes out too large, relative, because neighbours along rows share shot noise; 0 if not."""
-    return -2 * of_the_signal([group.along for group in found.groups if group.along is not None])
 
 
 def lit_darks(found: Survey) -> Iterator[str]:

@@ -121,6 +121,11 @@ class Survey:
         return tuple(group for group in self.darks if group.n_frames > 1)
 
     @property
+    def along(self) -> list[Along]:
+        """What pixels share along rows, of the groups that show it."""
+        return [group.along for group in self.groups if group.along is not None]
+
+    @property
     def has_exposures(self) -> bool:
         """Whether `repeated_darks` are of several exposures."""
         return len({group.exposure_s for group in self.repeated_darks}) > 1
