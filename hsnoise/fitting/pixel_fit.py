@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -21,6 +22,8 @@ from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.statistics.pixels.hits import Rays, rays_of
+from hsnoise.statistics.pixels.jump_search import Jumps
+from hsnoise.statistics.pixels.jumps import jumps_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.read_noise import read_noise_spread
 from hsnoise.statistics.pixels.sample import without_outliers
@@ -38,10 +41,7 @@ PATTERNS = {
 }
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
-ROW_GAIN_THERE = 3.0
-ROUNDS = 30
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
-UNKNOWN = 1e6  # relative error of an unknown value
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ class Channel:
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
         rays: hits of single frames; None if there are none.
+        jumps: pixels that jump between levels; None if there are none.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Channel:
     photo_response: tuple[float, float]
     warm: Warm | None
     rays: Rays | None
+    jumps: Jumps | None
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     flats = None if summary.flats is None else flat_gain(summary.flats)
     if flats is not None and np.isfinite(flats.gain).all():
         channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
-    estimate, covariance = _joint(channels)
+    estimate, covariance = joint_estimate(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
     known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
@@ -117,11 +119,12 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:
-    pixels = levels_of(found, c)
     (growth, growth_error), black = _growth_of_means(found, c)
     narrow = _narrow(found, c)
-    floor, floor_error = _temporal(found, c) if narrow is None else _of_narrow(narrow)
-    pixels = pixels if narrow is None else None  # rounding, not light, sets the variance of narrow noise
+    jumps, jumping = jumps_of(found, c) if narrow is None else (None, None)
+    floor, floor_error = _temporal(found, c, jumps) if narrow is None else _of_narrow(narrow)
+    # Rounding, not light, sets the variance of narrow noise.
+    pixels = levels_of(found, c, without=jumping) if narrow is None else None
     transfer = None if pixels is None else _transfer(pixels, found, _row_gain(found, c, growth))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
@@ -153,10 +156,11 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=row_spectrum(_shortest(found, c), found.shape[0]),
-        noise_spread=read_noise_spread(found, c, float(values[1])) if narrow is None else (0.0, np.inf),
+        noise_spread=read_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
+        jumps=jumps,
     )
 
 
@@ -278,8 +282,11 @@ def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
     return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
-def _temporal(found: Survey, c: int) -> tuple[float, float]:
-    """Temporal variance of the pixels at the shortest exposure, DN^2, without outliers, and its standard error."""
+def _temporal(found: Survey, c: int, jumps: Jumps | None) -> tuple[float, float]:
+    """Temporal variance of the pixels at the shortest exposure, DN^2, without outliers, and its standard error.
+
+    What jumping pixels that are no outliers add to it is taken off.
+    """
     group = found.shortest
     if group is None:
         return 0.0, UNKNOWN
@@ -287,7 +294,10 @@ def _temporal(found: Survey, c: int) -> tuple[float, float]:
     variance = variance[~found.stuck(c)]
     if not (variance > 0).any():
         return 0.0, UNKNOWN
-    return without_outliers(variance, group.n_frames)
+    mean, error = without_outliers(variance, group.n_frames)
+    if jumps is not None:
+        mean /= jumps.raises(lambda of: without_outliers(of, group.n_frames)[0], group.n_frames)
+    return mean, error
 
 
 def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -355,45 +365,3 @@ def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> 
     covariance[0, 0] = flats.standard_error[c] ** 2
     rows = row_gain_of(moments, flats.signal_dn[:, c], c)
     return replace(one, values=values, covariance=covariance, row_gain=rows)
-
-
-def _joint(channels: list[Channel]) -> tuple[np.ndarray, np.ndarray]:
-    """Gain [channel], read noise and dark current in electrons, which all colours share, by least squares."""
-    n = len(channels)
-    if all(one.covariance[0, 0] >= UNKNOWN**2 for one in channels):
-        return np.append(np.ones(n), [0.0, 0.0]), np.eye(n + 2) * UNKNOWN**2
-    data = np.concatenate([_without_rows(one) for one in channels])
-    weight = np.zeros((3 * n, 3 * n))
-    for c, one in enumerate(channels):
-        weight[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] = np.linalg.inv(one.covariance + np.diag([0, 1e-12, 1e-24]))
-    known = [c for c in range(n) if channels[c].covariance[0, 0] < (UNKNOWN / 2) ** 2]
-    gain = np.array([one.values[0] if c in known else np.nan for c, one in enumerate(channels)])
-    gain = np.where(np.isnan(gain), np.nanmean(gain) if known else 1.0, gain)
-    floor = np.array([max(data[3 * c + 1], 1e-6) for c in range(n)])
-    theta = np.concatenate([gain, [float(np.sqrt(np.mean(floor / gain**2)))], [float(np.mean(data[2::3] / gain))]])
-    for _ in range(ROUNDS):
-        model, slopes = _expected(theta, n)
-        information = slopes.T @ weight @ slopes + np.diag(np.append(np.full(n, 1e-14), [1e-14, 1e-14]))
-        step = np.linalg.solve(information, slopes.T @ weight @ (data - model))
-        theta = theta + np.clip(step, -0.5 * np.abs(theta) - 1e-9, 0.5 * np.abs(theta) + 1e-9)
-    off = data - model
-    chi2 = float(off @ weight @ off) / max(2 * n - 2, 1) if n > 1 else 1.0
-    return theta, np.linalg.inv(information) * max(chi2, 1.0)
-
-
-def _without_rows(one: Channel) -> np.ndarray:
-    """Gain, variance without signal less rounding, and growth, without what row gain adds to variances."""
-    widened = 1 + (one.row_gain[0] if one.row_gain[0] > ROW_GAIN_THERE * one.row_gain[1] else 0.0)
-    return np.array([one.values[0] / widened, (one.values[1] - ROUNDING) / widened, one.values[2]])
-
-
-def _expected(theta: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gain, variance and growth of each channel, and their derivatives."""
-    gain, sigma, rate = theta[:n], theta[n], theta[n + 1]
-    model, slopes = np.empty(3 * n), np.zeros((3 * n, n + 2))
-    model[0::3], model[1::3], model[2::3] = gain, gain**2 * sigma**2, gain * rate
-    for c in range(n):
-        slopes[3 * c, c] = 1
-        slopes[3 * c + 1, [c, n]] = 2 * gain[c] * sigma**2, 2 * gain[c] ** 2 * sigma
-        slopes[3 * c + 2, [c, n + 1]] = rate, gain[c]
-    return model, slopes

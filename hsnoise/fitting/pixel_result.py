@@ -21,12 +21,14 @@ from hsnoise.effects import (
     FrameOffset,
     HotPixels,
     PhotoResponseNonuniformity,
+    RandomTelegraphNoise,
     ReadNoiseNonuniformity,
     RowBankNoise,
     RowFixedPattern,
     RowNoise,
 )
-from hsnoise.fitting.pixel_fit import PATTERNS, ROW_GAIN_THERE, UNKNOWN, Channel, PixelFit, weighted_mean
+from hsnoise.fitting.pixel_fit import PATTERNS, Channel, PixelFit, weighted_mean
+from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -56,11 +58,12 @@ OF_PIXELS = (
     BlackShading,
     CorrelatedReadNoise,
     CosmicRays,
+    RandomTelegraphNoise,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
-PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-3  # chance deviations, share of the temporal variance
+PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
 
@@ -156,7 +159,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     noise_spread = _mean([c.noise_spread for c in pixel.channels])
     if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
         found["read_noise_nonuniformity"] = {"spread": noise_spread}
-    found |= _rays(pixel, gain)
+    found |= {**_rays(pixel, gain), **_jumps(pixel, gain)}
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
     response = _mean([c.photo_response for c in pixel.channels])
@@ -227,6 +230,17 @@ def _rays(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float,
     return {"cosmic_rays": {"rate": rate, "charge": charge, "at_readout": at_readout}}
 
 
+def _jumps(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """Pixels that jump, if all colours have them, of one kind: means over the colours."""
+    told = [(c.jumps, g) for c, g in zip(pixel.channels, gain, strict=True) if c.jumps is not None]
+    if len(told) < len(pixel.channels) or len({jumps[3:5] for jumps, _ in told}) > 1:
+        return {}
+    amplitude = _mean([(jumps.amplitude_dn[0] / g, jumps.amplitude_dn[1] / g) for jumps, g in told])
+    fraction, duty = (_mean([getattr(jumps, name) for jumps, _ in told]) for name in ("fraction", "duty"))
+    spread = float(told[0][0].exponential), np.inf
+    return {"random_telegraph_noise": {"fraction": fraction, "amplitude": amplitude, "duty": duty, "spread": spread}}
+
+
 def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
     """Axis and size of the strongest drift of the black level, of the first colour that has one."""
     many = [(axis, one) for c in pixel.channels[:1] for axis, one in c.shading.items()]
@@ -292,10 +306,18 @@ def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: Pix
             fields = {of: value if specs[of].low is None else max(value, 0.0) for of, (value, _) in measured.items()}
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
             fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}
-            drift = _shading(pixel) if name == "black_shading" else None
-            chosen = {} if drift is None else {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
-            effects.append(classes[name](**fields, **chosen))
+            effects.append(classes[name](**fields, **_settings(name, pixel)))
     return NoiseModel(effects, cfa=paper.cfa, shutter=paper.shutter, exposure_s=paper.exposure_s)
+
+
+def _settings(name: str, pixel: PixelFit) -> dict[str, Any]:
+    """What an effect has besides numbers."""
+    if name == "black_shading" and (drift := _shading(pixel)) is not None:
+        return {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
+    jumps = pixel.channels[0].jumps
+    if name == "random_telegraph_noise" and jumps is not None:
+        return {"double_sampling": jumps.double_sampling}
+    return {}
 
 
 def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:

@@ -138,3 +138,35 @@ def test_telegraph_pixels_jump_between_two_levels():
     # Over pixels the number of high frames is binomial.
     high = states.sum(0)
     assert abs(high.var() / (frames * duty * (1 - duty)) - 1) < 5 * np.sqrt(2 / high.size)
+
+
+def test_amplitudes_of_traps_are_exponential_at_a_spread_of_one():
+    drawn = darks(2, (300, 300), RandomTelegraphNoise(1.0, 7.0, 1.0, 1.0))
+    assert np.all(drawn[0] == drawn[1])  # always high: what is left is the map of amplitudes
+    sizes = drawn[0].ravel()
+    assert abs(sizes.mean() - 7.0) < 5 * 7.0 / np.sqrt(sizes.size)
+    for limit in (3.0, 7.0, 20.0):
+        share = np.exp(-limit / 7.0)
+        assert abs(np.mean(sizes > limit) - share) < 5 * np.sqrt(share * (1 - share) / sizes.size)
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.8])
+def test_the_mean_amplitude_does_not_depend_on_its_spread(spread):
+    sizes = darks(1, (300, 300), RandomTelegraphNoise(1.0, 7.0, 1.0, spread)).ravel()
+    assert abs(sizes.mean() - 7.0) < 5 * sizes.std() / np.sqrt(sizes.size)
+
+
+def test_two_samples_that_are_subtracted_have_three_levels_and_leave_the_mean():
+    frames, duty = 400, 0.2
+    effect = RandomTelegraphNoise(0.5, 7.0, duty, double_sampling=True)
+    drawn = darks(frames, (60, 60), effect)
+    assert set(np.unique(drawn)) == {-7.0, 0.0, 7.0}
+    states = drawn[:, drawn.max(0) > 0] / 7.0
+    for level, share in ((1.0, duty * (1 - duty)), (-1.0, duty * (1 - duty))):
+        assert abs(np.mean(states == level) - share) < 5 * np.sqrt(share * (1 - share) / states.size)
+    assert abs(drawn.mean(0)).max() < 7.0 * 6 * np.sqrt(2 * duty * (1 - duty) / frames)
+
+
+def test_a_setting_that_is_no_truth_value_is_refused():
+    with pytest.raises(ValueError, match=r"double_sampling: expected True or False, got 'yes'"):
+        RandomTelegraphNoise(0.1, 7.0, double_sampling="yes")

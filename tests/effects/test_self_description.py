@@ -88,6 +88,8 @@ DECLARED = [
     fx.DarkSignalNonuniformity(2.0),
     fx.HotPixels(0.2, 500.0),
     fx.RandomTelegraphNoise(0.5, 8.0, 0.4),
+    fx.RandomTelegraphNoise(0.5, 8.0, 0.4, 0.7),
+    fx.RandomTelegraphNoise(0.5, 8.0, 0.4, 1.0, double_sampling=True),
     fx.PeriodicBanding(2.0, 0.01),
     fx.PeriodicBanding(2.0, 0.13, "column", after_gain=True),
     fx.CosmicRays(5e6, 300.0),

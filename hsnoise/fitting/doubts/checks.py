@@ -57,7 +57,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *alone,
         *header_gain(result),
         *order_note(result),
-        *pixels_apart(found),
+        *pixels_apart(found, "random_telegraph_noise" in result.params),
         *of_signal,
         *lit_darks(found),
         *moved,

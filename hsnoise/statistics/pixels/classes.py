@@ -74,13 +74,17 @@ class Levels(NamedTuple):
     pedestal_sigma_dn: np.ndarray
 
 
-def levels_of(found: Survey, channel: int) -> Levels | None:
-    """The sampled pixels of one channel that are not stuck; None without two dark exposures of two frames."""
+def levels_of(found: Survey, channel: int, without: np.ndarray | None = None) -> Levels | None:
+    """The sampled pixels of one channel that are not stuck; None without two dark exposures of two frames.
+
+    without: others that are left out [pixel].
+    """
     groups = found.repeated_darks
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
     moving = ~found.stuck(channel)
+    moving = moving if without is None else moving & ~without
     if moving.sum() < FEWEST_ALIVE:
         return None
     level, variance, peak, whole = (
@@ -90,6 +94,16 @@ def levels_of(found: Survey, channel: int) -> Levels | None:
     sigma = _pedestal_sigmas([np.mean([p.halves.frame_means_dn for p in g.of(channel)], axis=0) for g in groups])
     sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
     return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
+
+
+def is_hot(found: Survey, channel: int) -> np.ndarray:
+    """Which sampled pixels of a channel grow faster than ordinary ones in both halves of the frames [pixel]."""
+    stuck = found.stuck(channel)
+    hot, pixels = np.zeros(len(stuck), bool), levels_of(found, channel)
+    if pixels is not None:
+        growth = slope_over(pixels.exposure_s, pixels.level)
+        hot[~stuck] = growth.min(0) > hot_from(growth)
+    return hot
 
 
 def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from hsnoise.statistics.pixels.classes import hot_from, levels_of, slope_over
+from hsnoise.statistics.pixels.classes import is_hot
 from hsnoise.statistics.pixels.sample import of_neighbours
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -26,11 +26,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     if lit:
         flags[_dead(found, channel)] |= FLAGS["dead"]
-    pixels = levels_of(found, channel)
-    if pixels is not None:
-        growth = slope_over(pixels.exposure_s, pixels.level)
-        moving = np.flatnonzero(~stuck)
-        flags[moving[growth.min(0) > hot_from(growth)]] |= FLAGS["hot"]
+    flags[is_hot(found, channel)] |= FLAGS["hot"]
     flags[_jumping(found.repeated_darks, channel, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
 

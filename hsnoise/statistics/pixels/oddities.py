@@ -155,14 +155,14 @@ def _levels(group: Group, c: int) -> np.ndarray:
     return group.pixels(c, "level_dn").astype(np.float64)
 
 
-def pixels_apart(found: Survey) -> Iterator[str]:
-    """Shares of defective pixels: stuck, dead, telegraph-like."""
+def pixels_apart(found: Survey, jumps: bool) -> Iterator[str]:
+    """Shares of defective pixels: stuck, dead, and telegraph-like unless their `jumps` are known."""
     for c, channel in enumerate(found.channels):
         shares = counts_of(flags_of(found, c))
         of = "" if channel == "mono" else f" of channel {channel}"
         if shares["stuck"] > MANY["stuck"]:
             yield f"{100 * shares['stuck']:.2g} % of the pixels{of} never change: they are stuck, and not noise."
-        if shares["telegraph"] > MANY["telegraph"]:
+        if shares["telegraph"] > MANY["telegraph"] and not jumps:
             yield (
                 f"{100 * shares['telegraph']:.2g} % of the pixels{of} are far noisier than others of their level"
                 " (telegraph-like)."

@@ -42,6 +42,7 @@ class Halves:
         lowest, highest [pixel]: extreme counts of all frames, DN.
         frame_means_dn [frame]: level of each frame relative to the typical one, DN.
         pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
+        third_dn3, fourth_dn4 [pixel]: third and fourth central moments over all frames, DN^3, DN^4.
         frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
         hits: pixels far above their level in one frame; None of too few frames.
     """
@@ -54,6 +55,8 @@ class Halves:
     highest: np.ndarray
     frame_means_dn: np.ndarray
     pair_variance_dn2: np.ndarray
+    third_dn3: np.ndarray
+    fourth_dn4: np.ndarray
     frame_noise_dn: np.ndarray
     hits: Hits | None
 
@@ -85,9 +88,24 @@ def halves_of(counts: np.ndarray) -> Halves:
     parts = [_moments(flat[half::2], added) for half in (0, 1)]
     level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
     whole = flat.var(0, ddof=1) - added
+    third, fourth = _higher(flat)
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
     frames = len(flat[::2]), len(flat[1::2])
-    return Halves(frames, level, variance, peak, lowest, highest, frame_means, whole, noise, hits_of(flat))
+    return Halves(
+        frames, level, variance, peak, lowest, highest, frame_means, whole, third, fourth, noise, hits_of(flat)
+    )
+
+
+def _higher(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Third and fourth central moments of values [frame, pixel], frame by frame: no copy of all of them."""
+    mean = flat.mean(0)
+    third, fourth = np.zeros_like(mean), np.zeros_like(mean)
+    for frame in flat:
+        off = frame - mean
+        square = off * off
+        third += square * off
+        fourth += square * square
+    return third / np.float32(len(flat)), fourth / np.float32(len(flat))
 
 
 def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
