@@ -13,7 +13,6 @@ from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, co
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
 from hsnoise.fitting.notes import closing_notes, outlier_fraction
-from hsnoise.fitting.pixel_fit import measure
 from hsnoise.fitting.pixel_result import POPULATION, result_of
 from hsnoise.fitting.profile import profile_errors
 from hsnoise.fitting.result import FitResult, Method, Status
@@ -123,7 +122,7 @@ def fit(
     seen = Evidence(found, summary)
     if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
         log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they show no gain")
-        return _ended(checked(result_of(measure(_all_of(source, found), summary), summary, model, source), seen))
+        return _ended(checked(result_of(seen.measured(_all_of(source, found)), summary, model, source), seen))
     result = replace(_pooled(summary, model, method), stack=source)
     return _ended(checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen))
 

@@ -156,12 +156,16 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=row_spectrum(_shortest(found, c), found.shape[0]),
-        noise_spread=read_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
+        noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
     )
+
+
+def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> tuple[float, float]:
+    return read_noise_spread(found, c, read_dn2) if jumps is None else jumps.noise_spread
 
 
 def _rays(found: Survey, c: int) -> Rays | None:

@@ -21,3 +21,7 @@ class Evidence:
     def darks(self) -> PixelFit:
         """Pixel transfer of the darks, ignoring the flats."""
         return measure(self.survey, replace(self.summary, flats=None))
+
+    def measured(self, whole: Survey) -> PixelFit:
+        """What `measure` finds in a survey of the whole capture, flats included."""
+        return self.darks if whole is self.survey and self.summary.flats is None else measure(whole, self.summary)

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-DRAWN = 6000  # pixels
+DRAWN, ORDINARY = 6000, 40_000  # pixels with a trap, and without
+CORE, WIDTH = 16, 0.2  # bins of the variance of pixels that are not noisy; the last has no end
 STEP, FEWEST_IN_BIN = 1.25, 30  # ratio of the variances that bound a bin; pixels above the last
 ALIKE = 0.05  # relative error of a statistic: no two traps are alike
 STARTS = (2.5, 5.0)  # amplitudes in units of the noise, beyond a count
-STEPS = np.array([0.2, 0.2, 0.04])  # of ln fraction, ln amplitude and duty: slopes of noisy functions
+STEPS = np.array([0.2, 0.2, 0.04, 0.04])  # of ln fraction, ln amplitude, duty, and spread of ln noise over pixels
 # Less than the noise would explain the few by jumps of most pixels that nobody sees.
-LOW, HIGH = np.array([-14.0, 0.0, 0.01]), np.array([0.0, 4.5, 0.99])
-TRIES = 12  # steps of a search
+LOW, HIGH = np.array([-14.0, 0.0, 0.01, 0.0]), np.array([0.0, 4.5, 0.99, 0.8])
+FEW, MANY = 3, 10  # steps of a search of each kind, and of the best two
 
 Number = tuple[float, float]
 
@@ -34,6 +36,7 @@ class Jumps(NamedTuple):
     duty: Number
     double_sampling: bool
     exponential: bool
+    noise_spread: Number
     noise_dn2: float
 
     def of_traps(self, states: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -108,110 +111,175 @@ class Moments(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Search:
-    """What is to be reproduced, and the random numbers that all tries share.
+class Bins:
+    """Shares of all pixels by bin of the variance, the noisy ones and the others, and mean shapes of the noisy ones.
 
-    edges: of bins of the variance; shares [bin] of all pixels, shapes [bin, shape], with their errors; limits: of noisy
-    pixels; noise, states: by exposure, [frame, pixel] and [2, frame, pixel]; depth [pixel].
+    Errors of shares and shapes are those of chance.
     """
 
-    edges: np.ndarray
-    shares: tuple[np.ndarray, np.ndarray]
-    shapes: tuple[np.ndarray, np.ndarray]
-    limits: np.ndarray
-    noise_dn2: float
+    noisy: np.ndarray
+    others: np.ndarray
+    shapes: np.ndarray
+    share_errors: np.ndarray
+    shape_errors: np.ndarray
+
+    @classmethod
+    def of(cls, pixels: Moments, limits: np.ndarray, edges: np.ndarray) -> Bins:
+        number, is_noisy = len(pixels.variance), pixels.is_noisy(limits)
+        counts, shapes, errors = pixels.noisy(limits).in_bins(edges)
+        number_of = np.minimum((pixels.variance[~is_noisy] / WIDTH).astype(int), CORE - 1)
+        others = np.bincount(np.maximum(number_of, 0), minlength=CORE)
+        chance = np.sqrt(np.concatenate([counts, others]) + 1) / number
+        return cls(counts / number, others / number, shapes, chance, errors)
+
+    @property
+    def shares(self) -> np.ndarray:
+        return np.concatenate([self.noisy, self.others])
+
+
+@dataclass(frozen=True)
+class Chance:
+    """Random numbers that all tries share.
+
+    noise, states: of pixels with a trap, by exposure [frame, pixel] and [2, frame, pixel]; depth [pixel]; strength,
+    squares: of ordinary pixels, normal [pixel], and relative variances of halves and between halves [3, pixel].
+    """
+
     noise: list[np.ndarray]
     states: list[np.ndarray]
     depth: np.ndarray
+    strength: np.ndarray
+    squares: np.ndarray
+    dof: np.ndarray
 
     @classmethod
-    def of(cls, measured: Moments, limits: np.ndarray, frames: Sequence[int], noise_dn2: float) -> Search:
-        """Of pixels over so many frames of each exposure."""
-        noisy, pixels = measured.noisy(limits), len(measured.variance)
-        ordered, rng = np.sort(noisy.variance), np.random.default_rng(0)
-        low, top = ordered[0], ordered[-min(FEWEST_IN_BIN, len(ordered))]
-        edges = np.append(low * STEP ** np.arange(max(int(np.log(top / low) / np.log(STEP)), 1)), np.inf)
-        counts, shapes, errors = noisy.in_bins(edges)
+    def of(cls, frames: Sequence[int]) -> Chance:
+        rng = np.random.default_rng(0)
+        dof = np.array([sum((n + 1 - half) // 2 - 1 for n in frames) for half in (0, 1)] + [len(frames)])
         return cls(
-            edges=edges,
-            shares=(counts / pixels, np.hypot(np.sqrt(counts + 1), ALIKE * counts) / pixels),
-            shapes=(shapes, np.hypot(errors, ALIKE * np.abs(shapes))),
-            limits=limits,
-            noise_dn2=noise_dn2,
             noise=[rng.standard_normal((n, DRAWN), np.float32) for n in frames],
             states=[rng.random((2, n, DRAWN), np.float32) for n in frames],
             depth=-np.log((rng.permutation(DRAWN) + 0.5) / DRAWN),  # evenly over the distribution
+            strength=rng.standard_normal(ORDINARY),
+            squares=np.stack([rng.chisquare(n, ORDINARY) / n for n in dof]),
+            dof=dof,
         )
 
-    def drawn(self, of: Jumps | None) -> Moments:
-        """Moments of pixels that all have a trap, or of normal noise of any strength."""
-        step = 1 / np.sqrt(self.noise_dn2)
-        own, offset = np.sqrt(max(1 - step**2 / 12, 0.1)), np.linspace(0, step, DRAWN, endpoint=False)
-        parts = []
-        for noise, states in zip(self.noise, self.states, strict=True):
-            beside = noise * np.expm1(self.depth / 2) if of is None else of.of_traps(states, self.depth)
-            values = own * noise + offset + beside.astype(np.float32)
-            values = (step * np.round(values / step)).astype(np.float32)
-            off = values - values.mean(0)
-            square = off * off
-            halves = [values[half::2] for half in (0, 1)]
-            parts.append(
-                (
-                    [len(one) for one in halves],
-                    square.sum(0) / (len(values) - 1),
-                    np.stack([one.var(0, ddof=1) for one in halves]),
-                    (square * off).mean(0),
-                    (square * square).mean(0),
-                )
-            )
-        return Moments.of(parts)
 
-    def off(self, of: Jumps) -> np.ndarray:
-        """Shares and shapes of jumps, less the measured ones, in units of their errors."""
-        counts, shapes, errors = self.drawn(of).noisy(self.limits).in_bins(self.edges)
-        share, fraction = counts / DRAWN, of.fraction[0]
-        chance = np.hypot(self.shares[1], fraction * np.sqrt((share + 1 / DRAWN) / DRAWN))
-        return np.concatenate([(fraction * share - self.shares[0]) / chance, self._shapes_off(shapes, errors)])
+@dataclass(frozen=True)
+class Search:
+    """What is to be reproduced, and with what: edges of the bins of noisy pixels, and their limits."""
+
+    measured: Bins
+    edges: np.ndarray
+    limits: np.ndarray
+    noise_dn2: float
+    chance: Chance
+    normal: np.ndarray  # shapes of normal noise [bin, shape]
+    ordinary: Callable[[float], Bins]  # of pixels that do not jump, by the spread of their noise
+
+    @classmethod
+    def of(cls, pixels: Moments, limits: np.ndarray, frames: Sequence[int], noise_dn2: float) -> Search:
+        """Of pixels over so many frames of each exposure."""
+        ordered = np.sort(pixels.noisy(limits).variance)
+        low, top = ordered[0], ordered[-min(FEWEST_IN_BIN, len(ordered))]
+        edges = np.append(low * STEP ** np.arange(max(int(np.log(top / low) / np.log(STEP)), 1)), np.inf)
+        chance = Chance.of(frames)
+        # Given its variance, the shape of normal noise does not depend on its strength.
+        of_normal = _over_time(chance, noise_dn2, np.exp(chance.depth / 2), None)
+        normal = Bins.of(of_normal, limits, edges).shapes
+
+        @lru_cache(maxsize=8)
+        def ordinary(spread: float) -> Bins:
+            halves = np.exp(2 * spread * chance.strength) * chance.squares
+            variance = chance.dof @ halves / chance.dof.sum()
+            nothing = np.zeros_like(variance)
+            return Bins.of(Moments(variance, halves[:2], nothing, nothing), limits, edges)
+
+        return cls(Bins.of(pixels, limits, edges), edges, limits, noise_dn2, chance, normal, ordinary)
+
+    def drawn(self, of: Jumps) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Shares and shapes of jumping and ordinary pixels whose noise differs, and their errors by chance."""
+        spread = of.noise_spread[0]
+        strength = np.exp(spread * self.chance.strength[:DRAWN])
+        jumping = Bins.of(_over_time(self.chance, self.noise_dn2, strength, of), self.limits, self.edges)
+        ordinary = self.ordinary(spread)
+        fraction = of.fraction[0]
+        several = fraction * jumping.noisy, (1 - fraction) * ordinary.noisy
+        weight = (several[0] / np.maximum(sum(several), 1e-12))[:, None]
+        shares = fraction * jumping.shares + (1 - fraction) * ordinary.shares
+        errors = np.hypot(fraction * jumping.share_errors, (1 - fraction) * ordinary.share_errors)
+        return shares, weight * jumping.shapes + (1 - weight) * self.normal, errors, jumping.shape_errors
+
+    def off(self, of: Jumps) -> tuple[np.ndarray, np.ndarray]:
+        """Shares and shapes of jumps, less the measured, in units of their errors."""
+        shares, shapes, share_errors, shape_errors = self.drawn(of)
+        one = self.measured
+        chance = np.hypot(share_errors, np.hypot(one.share_errors, ALIKE * one.shares))
+        return (shares - one.shares) / chance, self._shapes_off(shapes, shape_errors)
 
     def _shapes_off(self, shapes: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        return ((shapes - self.shapes[0]) / np.hypot(self.shapes[1], errors)).ravel()
+        one = self.measured
+        error = np.sqrt(errors**2 + one.shape_errors**2 + (ALIKE * one.shapes) ** 2)
+        return ((shapes - one.shapes) / error).ravel()
 
-    def misfit(self, of: Jumps | None) -> float:
-        """Chi-square of the shapes, of jumps or of normal noise of any strength."""
-        _, shapes, errors = self.drawn(of).noisy(self.limits).in_bins(self.edges)
-        return float(np.sum(self._shapes_off(shapes, errors) ** 2))
+    def misfit_of_normal(self) -> float:
+        """Chi-square of the shapes of normal noise, of any strength."""
+        return float(np.sum(self._shapes_off(self.normal, np.zeros_like(self.normal)) ** 2))
 
-    def best(self) -> Jumps:
-        """The nearest jumps, with the errors of least squares: larger where the model does not describe the pixels."""
-        both = (False, True)
-        found = [self._nearest(double, tailed, start) for double, tailed, start in product(both, both, STARTS)]
-        return min(found, key=lambda one: one[0])[1]
+    def best(self) -> tuple[Jumps, float]:
+        """The nearest jumps, with the errors of least squares (larger where they do not describe the pixels), and the
+        chi-square of the shapes."""
+        visible = np.log(min(3 * float(self.measured.noisy.sum()), 0.5))
+        starts = [[visible, np.log(size + 1 / np.sqrt(self.noise_dn2)), 0.2, 0.05] for size in STARTS]
+        kinds = product((False, True), repeat=2)
+        found = [self._nearest(kind, np.array(start), FEW) for kind, start in product(kinds, starts)]
+        found.sort(key=lambda one: one[1].cost)
+        kind, end = min((self._nearest(kind, end.x, MANY) for kind, end in found[:2]), key=lambda one: one[1].cost)
+        worse = max(1.0, 2 * end.cost / max(len(end.fun) - len(end.x), 1))
+        covariance = worse * np.linalg.inv(end.jac.T @ end.jac + 1e-6 * np.eye(len(end.x)))
+        jumps = self._at(end.x, np.sqrt(np.diagonal(covariance)), kind)
+        return jumps, float(np.sum(self.off(jumps)[1] ** 2))
 
-    def _nearest(self, double: bool, exponential: bool, amplitude: float) -> tuple[float, Jumps]:
-        """Of one kind, and their chi-square."""
+    def _nearest(self, kind: tuple[bool, bool], start: np.ndarray, tries: int):
+        """The kind, and the end of a search."""
 
         def off(x: np.ndarray) -> np.ndarray:
-            return self.off(self._at(x, np.zeros(3), double, exponential))
+            return np.concatenate(self.off(self._at(x, np.zeros(len(x)), kind)))
 
         def slopes(x: np.ndarray) -> np.ndarray:
             ends = [[np.clip(x + way * step, LOW, HIGH) for way in (1, -1)] for step in np.diag(STEPS)]
             return np.stack([(off(up) - off(down)) / np.sum(up - down) for up, down in ends], 1)
 
-        visible = min(3 * float(self.shares[0].sum()), 0.5)
-        start = np.array([np.log(visible), np.log(amplitude + 1 / np.sqrt(self.noise_dn2)), 0.2])
-        found = least_squares(off, start, slopes, (LOW, HIGH), x_scale=STEPS, max_nfev=TRIES)
-        worse = max(1.0, 2 * found.cost / max(len(found.fun) - len(start), 1))
-        covariance = worse * np.linalg.inv(found.jac.T @ found.jac + 1e-6 * np.eye(len(start)))
-        return float(found.cost), self._at(found.x, np.sqrt(np.diagonal(covariance)), double, exponential)
+        return kind, least_squares(off, start, slopes, (LOW, HIGH), x_scale=STEPS, max_nfev=tries)
 
-    def _at(self, x: np.ndarray, errors: np.ndarray, double: bool, exponential: bool) -> Jumps:
-        """Jumps of ln fraction, ln amplitude (in units of the noise) and duty."""
+    def _at(self, x: np.ndarray, errors: np.ndarray, kind: tuple[bool, bool]) -> Jumps:
+        """Jumps of ln fraction, ln amplitude (in units of the noise), duty and spread of the noise."""
         (fraction, size), scale = np.exp(x[:2]), float(np.sqrt(self.noise_dn2))
         return Jumps(
             fraction=(float(fraction), float(fraction * errors[0])),
             amplitude_dn=(float(scale * size), float(scale * size * errors[1])),
             duty=(float(x[2]), float(errors[2])),
-            double_sampling=double,
-            exponential=exponential,
+            double_sampling=kind[0],
+            exponential=kind[1],
+            noise_spread=(float(x[3]), float(errors[3])),
             noise_dn2=self.noise_dn2,
         )
+
+
+def _over_time(chance: Chance, noise_dn2: float, strength: np.ndarray, of: Jumps | None) -> Moments:
+    """Moments of pixels whose noise has this strength, and who jump if `of` says how."""
+    step = 1 / np.sqrt(noise_dn2)
+    own, offset = np.sqrt(max(1 - step**2 / 12, 0.1)), np.linspace(0, step, DRAWN, endpoint=False)
+    parts = []
+    for noise, states in zip(chance.noise, chance.states, strict=True):
+        values = own * strength * noise + offset
+        values = values if of is None else values + of.of_traps(states, chance.depth)
+        values = (step * np.round(values / step)).astype(np.float32)
+        off = values - values.mean(0)
+        square = off * off
+        halves = [values[half::2] for half in (0, 1)]
+        frames, variance = [len(one) for one in halves], square.sum(0) / (len(values) - 1)
+        of_halves = np.stack([one.var(0, ddof=1) for one in halves])
+        parts.append((frames, variance, of_halves, (square * off).mean(0), (square * square).mean(0)))
+    return Moments.of(parts)

@@ -17,9 +17,9 @@ FEWEST_FRAMES, MOST_FRAMES = 8, 64  # of all exposures together
 OF_AN_EXPOSURE = 4  # frames, at least
 FEWEST, LEAST = 100, 3e-4  # pixels that jump visibly, and their share
 TOGETHER = 2.0  # times as many noisy in both halves as by chance: heavy tails strike any pixel
-MANY, ROUNDS = 0.05, 4  # share of pixels that move the median; how often it is corrected
-SURE = 2.5  # standard errors of the amplitude
-FAR_BETTER = 0.5  # of the misfit of normal noise
+MANY, ROUNDS = 0.1, 3  # share of pixels that move the median; how often it is corrected
+SURE = 2.5  # standard errors of fraction and amplitude
+FAILS, FAR_BETTER = 2.0, 0.5  # chi-square of normal noise per degree of freedom; how much of it jumps may leave
 
 
 def jumps_of(found: Survey, channel: int) -> tuple[Jumps | None, np.ndarray]:
@@ -50,12 +50,15 @@ def _best(pixels: Moments, limits: np.ndarray, frames: list[int], typical_dn2: f
     noise_dn2 = typical_dn2
     for _ in range(ROUNDS):
         search = Search.of(pixels, limits, frames, noise_dn2)
-        best = search.best()
+        best, misfit = search.best()
+        is_sure = all(value > SURE * error for value, error in (best.fraction, best.amplitude_dn))
+        normal = search.misfit_of_normal()
+        if not is_sure or normal < FAILS * search.normal.size or misfit > FAR_BETTER * normal:
+            return None
         if best.fraction[0] < MANY:
             break
         noise_dn2 = typical_dn2 / best.raises(_median, frames[0])  # the typical pixel is noisier by them
-    is_sure = best.amplitude_dn[0] > SURE * best.amplitude_dn[1]
-    return best if is_sure and search.misfit(best) < FAR_BETTER * search.misfit(None) else None
+    return best
 
 
 def _median(variances: np.ndarray) -> float:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -18,16 +16,15 @@ NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
 
 
-def read_noise_spread(found: Survey, channel: int, read_dn2: float, jumps: Jumps | None = None) -> tuple[float, float]:
+def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[float, float]:
     """Standard deviation of the logarithm of read noise over pixels, and its error; infinite if undetermined.
 
-    read_dn2: mean square of the read noise, DN^2; jumps: of pixels that jump, if they are known.
+    read_dn2: mean square of the read noise, DN^2.
 
     From the covariance of two temporal variances of each pixel, less what follows from its level and dark signal (shot
     noise). First without the noisiest pixels, because those that jump or are hit have another kind of noise; log-normal
     read noise, drawn and cut in the same way, shows how much of its covariance remains. If these quiet pixels differ
-    beyond chance, the spread is that of all pixels except outliers. Beside jumps that are known it is that of the quiet
-    ones, and the pixels that are drawn jump as well.
+    beyond chance, the spread is that of all pixels except outliers.
     """
     groups, moving = sorted(found.repeated_darks, key=lambda g: g.exposure_s), ~found.stuck(channel)
     if not groups or moving.sum() < FEWEST_PIXELS or read_dn2 <= 0:
@@ -38,14 +35,9 @@ def read_noise_spread(found: Survey, channel: int, read_dn2: float, jumps: Jumps
     short, long = (group.pixels(channel, "level_dn")[:, moving] for group in (groups[0], groups[-1]))
     by = [short, long - short][: len(groups)]
     left, error = _together(first, second, by, _is_quiet(first, second))
-    spreads, expected = _of_quiet(frames, jumps)
+    spreads, expected = _of_quiet(frames[0] - 1, frames[1] - 1)
     if left - expected[0] < SURE * error:
         return 0.0, float(np.interp(expected[0] + error, expected, spreads))
-    if jumps is not None and jumps.fraction[0] > NOISIEST:
-        return 0.0, np.inf  # the quiet ones jump, too
-    if jumps is not None:
-        spread, one_up = (float(np.interp(x, expected, spreads)) for x in (left, left + error))
-        return spread, max(one_up - spread, 1e-6)
     usual = is_no_outlier(first, frames[0]) & is_no_outlier(second, frames[1])
     left, error = _together(first, second, by, usual)
     # Read noise is only part of all noise, so it differs by more.
@@ -81,39 +73,15 @@ def _is_quiet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return both <= np.quantile(both, 1 - NOISIEST)
 
 
-class _Chance(NamedTuple):
-    """Sums of squares and products [pixel] that give the variance of noise and jumps for any strength of the noise."""
-
-    noise: np.ndarray
-    both: np.ndarray | float
-    jumps: np.ndarray | float
-
-    @classmethod
-    def of(cls, rng: np.random.Generator, frames: int, jumps: Jumps | None) -> _Chance:
-        if jumps is None:
-            return cls(rng.chisquare(frames - 1, SIMULATED) / (frames - 1), 0.0, 0.0)
-        noise, jump = (rng.standard_normal((frames, SIMULATED), np.float32), jumps.drawn(rng, frames, SIMULATED))
-        noise, jump = noise - noise.mean(0), jump - jump.mean(0)
-        return cls(
-            *(np.einsum("fp,fp->p", *two) / (frames - 1) for two in ((noise, noise), (noise, jump), (jump, jump)))
-        )
-
-    def variance(self, strength: np.ndarray) -> np.ndarray:
-        return strength**2 * self.noise + 2 * strength * self.both + self.jumps
-
-
 @cache
-def _of_quiet(frames: tuple[int, ...], jumps: Jumps | None) -> tuple[np.ndarray, np.ndarray]:
-    """Spreads of log-normal read noise, and the covariance of the quiet pixels' relative variances for each.
-
-    frames: from which the two variances are.
-    """
+def _of_quiet(*dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Spreads of log-normal read noise, and the covariance of the quiet pixels' relative variances for each."""
     rng = np.random.default_rng(0)
-    z, chance = rng.standard_normal(SIMULATED), [_Chance.of(rng, n, jumps) for n in frames]
+    z, chance = rng.standard_normal(SIMULATED), [rng.chisquare(n, SIMULATED) / n for n in dof]
     spreads = np.linspace(0.0, 1.2, 25)
     expected = []
     for spread in spreads:
-        first, second = (one.variance(np.exp(spread * z)) for one in chance)
+        first, second = (np.exp(2 * spread * z) * one for one in chance)
         kept = _is_quiet(first, second)
         expected.append(covariance_of(first[kept] / first[kept].mean(), second[kept] / second[kept].mean()))
     return spreads, np.maximum.accumulate(expected)
