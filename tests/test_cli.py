@@ -127,8 +127,11 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     monkeypatch.setattr(_demo, "FRAMES", 2)
     monkeypatch.setattr(_demo, "SHAPE", (32, 64))
     monkeypatch.setattr(_demo, "EXPOSURES_S", (0.1, 0.4))
+    pages = []  # tests/test_report.py writes them
+    monkeypatch.setattr("hsnoise.report.write_report", lambda path, *_, **__: pages.append(path))
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out), "--debug"]) == 0
+    assert set(pages) == {out / "report.html"}
     said = capsys.readouterr().out
     lines = {line.split()[0]: line.split() for line in said.splitlines() if line.split()}
     assert lines["gain.R"][3] == "DN/e-"

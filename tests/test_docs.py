@@ -21,7 +21,11 @@ from skimage.data import astronaut, coffee
 from skimage.io import imsave
 
 import hsnoise
+from hsnoise.cli import results
 from hsnoise.cli.main import main
+from hsnoise.criticism import Step, Story
+from hsnoise.criticism.outcomes import Ended, Ending
+from hsnoise.simulation import portion
 from hsnoise.simulation.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +64,10 @@ def commands(block: str) -> list[str]:
     if any(line.startswith("$ ") for line in lines):
         lines = [line[2:] for line in lines if line.startswith("$ ")]
     return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+def without_comment(command: str) -> str:
+    return shlex.join(shlex.split(command, comments=True))
 
 
 def without_numbers(text: str) -> list[str]:
@@ -101,7 +109,23 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def few_draws(monkeypatch):
-    """Comparisons by eight draws of the model, for time's sake."""
+    """Comparisons by eight draws, for time's sake, and of one size with those of figures: most of it is compilation.
+
+    Figures are drawn, but files of figures stay empty: other tests look at those. A story is that of the first model
+    alone: tests/test_logging.py has one from the loop, and the slow tests run all that the pages say.
+    """
+
+    def improved(stack, tell, *, keep, **_):
+        fit = hsnoise.fit(stack)
+        first = Step(fit, hsnoise.compare(fit, stack), None, None, 0.0, ())
+        keep(story := Story((first,), Ending(Ended.STEPS, 0)))
+        return story
+
+    monkeypatch.setattr(results, "improved", improved)
+    monkeypatch.setattr(results, "write_figure", lambda path, figure: path.touch())
+    monkeypatch.setattr(portion, "MOST_PIXELS", 1)  # of four frames and 64 columns
+    monkeypatch.setattr(portion, "LEAST_FRAMES", 4)
+    monkeypatch.setattr(portion, "MIDDLE", (4, 240, 64))
     reference = Simulator.reference
     monkeypatch.setattr(
         Simulator, "reference", lambda self, model, n, *first: reference(self, model, min(n, 8), *first)
@@ -112,7 +136,7 @@ class Reader:
     """Runs a page: Python blocks share their names, commands of hsnoise run in this process."""
 
     def __init__(self, page: Path, monkeypatch, capsys) -> None:
-        self.page, self.capsys = page, capsys
+        self.page, self.capsys, self.said = page, capsys, {}
         self.module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
         self.module.__dict__.update(np=np, jax=jax, hsnoise=hsnoise)
         monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
@@ -121,7 +145,9 @@ class Reader:
         if language == "python":
             exec(compile(block, name_of(self.page), "exec"), self.module.__dict__)
         elif language in ("sh", "console"):
-            said = "".join(self.command(line) for line in commands(block))
+            # A transcript may show what a command printed that ran before.
+            ran = self.said if language == "console" else {}
+            said = "".join(ran.get(without_comment(line)) or self.command(line) for line in commands(block))
             if language == "console":
                 self.compare(block, said)
 
@@ -139,6 +165,7 @@ class Reader:
         assert status == 0 or (status == 1 and words[0] in ("fit", "improve")), (
             f"{line}: exit status {status}\n{out}\n{err}"
         )
+        self.said[without_comment(line)] = out
         return out
 
     def compare(self, block: str, said: str) -> None:

@@ -95,7 +95,8 @@ def test_coloured_rows_match_the_dense_gaussian(sigma, exponent, noise, mean):
     nodes = nodes_over(0.05, 2.0, 0.05, 0.13, 500)
     distance = np.asarray(nodes.beta)[0] - y[..., None]
     curves = -0.5 * distance**2 / variance[..., None] - 0.5 * np.log(2 * np.pi * variance)[..., None]
-    ours = rows.log_evidence_coloured(one_group(jnp.asarray(curves), nodes), jnp.asarray(spectrum))
+    evidence = jax.jit(rows.log_evidence_coloured)  # one program, not one for each operation
+    ours = evidence(one_group(jnp.asarray(curves), nodes), jnp.asarray(spectrum))
     np.testing.assert_allclose(ours, dense_log_evidence(y, variance, covariance), rtol=1e-4, atol=0.15)
 
 

@@ -50,44 +50,9 @@ CAMERAS = {
 }
 
 
-# All effects with nothing to do: one program draws a clean capture and, with one replaced, that of each effect.
-NOTHING = (
-    SharedRowGain(0.0),
-    RowNoise(0.0),
-    RowBankNoise(0.0),
-    ColumnNoise(0.0),
-    RowFixedPattern(0.0),
-    ColumnFixedPattern(0.0),
-    FrameOffset(0.0),
-    DarkSignalNonuniformity(0.0),
-    HotPixels(0.0, 0.0),
-    AmplifierGlow(0.0, 0.3),
-    DarkCurrentNonuniformity(0.0),
-    RandomTelegraphNoise(0.0, 0.0, 0.4),
-    HeavyTailedReadNoise(1e4),
-    ReadNoiseNonuniformity(0.0),
-    PeriodicBanding(0.0, 0.13),
-    Crosstalk(0.0),
-    ReadoutBandwidth(0.0),
-    ReadoutOvershoot(0.0),
-    ImageLag(0.0),
-    OddEvenPattern(0.0),
-    TapOffsets(0.0, taps=4),
-    BlackShading(0.0, 0.4),
-    AdcNonuniformity(0.0),
-    MissingCodes(1.0),
-    CosmicRays(0.0, 1.0),
-    BlackClamp([0.0, 0.0, 0.0]),
-)
-
-
 def model_with(camera, effect):
-    """The camera with one effect; the Grasshopper's always holds all of NOTHING, in one order."""
+    """The camera, with one effect more: it leaves the draws of the others as they are."""
     model, _ = CAMERAS[camera]
-    if camera == "grasshopper3":
-        for nothing in NOTHING:
-            model = model.add(effect if effect is not None and effect.name == nothing.name else nothing)
-        return model
     return model if effect is None else model.add(effect)
 
 
