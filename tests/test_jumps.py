@@ -32,8 +32,8 @@ def jumps(frames, fraction, mean_dn, duty, double, exponential, seed=2):
     ("frames", "fraction", "mean_dn", "duty", "double", "exponential"),
     [
         (8, 0.01, 20.0, 0.3, False, False),
-        (12, 0.02, 14.0, 0.5, False, True),
-        (20, 0.01, 16.0, 0.2, True, False),
+        pytest.param(12, 0.02, 14.0, 0.5, False, True, marks=pytest.mark.slow),
+        pytest.param(20, 0.01, 16.0, 0.2, True, False, marks=pytest.mark.slow),
         (24, 0.03, 12.0, 0.15, True, True),
     ],
 )
@@ -45,6 +45,7 @@ def test_fraction_size_duty_and_kind_are_found(frames, fraction, mean_dn, duty, 
         assert 0 < error < true / 3 and abs(value - true) < 4 * error, (value, error, true)
 
 
+@pytest.mark.slow
 def test_many_jumping_pixels_move_the_typical_one_and_are_counted_all_the_same():
     found = jumps_of(survey(capture(noise(16) + jumps(16, 0.2, 16.0, 0.3, False, False))), 0)[0]
     assert abs(found.fraction[0] - 0.2) < 0.03 and abs(found.amplitude_dn[0] - 16.0) < 1.6
@@ -70,7 +71,7 @@ def struck(frames):
     [
         noise(16),
         noisier(16, 0.3),
-        noisier(16, 0.6),
+        pytest.param(noisier(16, 0.6), marks=pytest.mark.slow),
         noise(16) + hot(16),
         noise(16) + struck(16),
         NOISE_DN * np.random.default_rng(3).standard_t(4, (16, *SHAPE)),

@@ -104,6 +104,7 @@ def test_histograms_show_all_pixels_and_the_expected_ones():
             np.testing.assert_allclose((values * np.diff(edges)).sum(), total, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_residuals_of_a_true_model_are_of_order_one():
     figure = plots.histograms(fitted(100.0, "global", True))
     residuals = np.concatenate([strip.lines[-1].get_ydata() for strip in figure.axes[1::2]])

@@ -112,7 +112,8 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
     known &= (summary.flats is not None) | (abs(estimate[len(channels)]) < MOST_READ_NOISE_E)
     read_dn2 = float(np.mean([max(one.values[1] - ROUNDING, ROUNDING) for one in channels]))
-    ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2)
+    unlit = summary.flats is None and not summary.exposure_s.any()
+    ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, _shortest(found, c)) for c, one in enumerate(channels)]
     return PixelFit(tuple(channels), flats, ringing, estimate, covariance, bool(known.all()))
@@ -252,14 +253,15 @@ def _shortest(found: Survey, c: int) -> list[Plane]:
 
 
 def _shadings(found: Survey, c: int) -> dict[str, Shading]:
-    """Drifts of the black level along the rows and down the frame."""
+    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one."""
     planes, out = _shortest(found, c), {}
     for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
         if planes:
             noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
             one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
             out |= {} if one is None else {axis: one}
-    return out
+    largest = max(out, key=lambda axis: out[axis].amplitude_dn, default=None)
+    return {} if largest is None else {largest: out[largest]}
 
 
 def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:

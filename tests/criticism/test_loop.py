@@ -46,6 +46,7 @@ def capture(*effects, seed=900, **layout):
     return draw_capture(seed, model, empty_stack(**layout))
 
 
+@pytest.mark.slow
 def test_own_samples_have_error_one():
     errors = [hsnoise.compare(MODEL, capture(seed=900 + i), draws=24).error for i in range(3)]
     assert 0.5 < np.median(errors) < 1.8

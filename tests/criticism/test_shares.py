@@ -32,6 +32,7 @@ def capture(model: hsnoise.NoiseModel, exposures_s=EXPOSURES_S, frames: int = 6)
     return hsnoise.FrameStack(counts, exposures_s, black_level=64, white_level=65535, cfa="RGGB", shutter="global")
 
 
+@pytest.mark.slow
 def test_the_true_model_leaves_no_component_unexplained():
     found = hsnoise.compare(CAMERA, capture(CAMERA), draws=16)
     assert found.largest_unexplained is None and "beyond chance" in found.unexplained and found.fits

@@ -266,8 +266,12 @@ def _of_neighbours(result: FitResult) -> Iterator[str]:
     ringing = result.transfer.ringing if result.transfer is not None else None
     if ringing is not None and "correlated_read_noise" in result.params:
         share = ringing.share[0] * ringing.memory[0] * np.cos(2 * np.pi * ringing.frequency[0])
+        unlit = result.summary.flats is None and not result.summary.exposure_s.any()
+        signal = (
+            "; whether they share their signal, too, only lit frames show" if unlit else ", but not of the shot noise"
+        )
         yield (
-            f"Neighbours along a row share {share:+.1%} of the variance of the read noise, but not of the shot noise"
+            f"Neighbours along a row share {share:+.1%} of the variance of the read noise{signal}"
             " (correlated_read_noise)."
         )
 

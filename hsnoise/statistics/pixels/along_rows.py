@@ -79,11 +79,12 @@ def _product(x: np.ndarray, lag: int) -> float:
     return float(np.mean(x[:, lag:] * x[:, :-lag], dtype=np.float64))
 
 
-def of_read_noise(groups: Sequence[Along], read_dn2: float) -> Ringing | None:
+def of_read_noise(groups: Sequence[Along], read_dn2: float, *, unlit: bool = False) -> Ringing | None:
     """The correlated part of the read noise, DN^2, if it is there and does not act on the signal.
 
     What acts on the signal, such as an amplifier that has not settled, correlates shot noise as much, and reaches one
-    pixel far. Where no group has shot noise, and nothing reaches farther, the two cannot be separated: None.
+    pixel far. Where no group has shot noise, and nothing reaches farther, the two cannot be separated: None, unless all
+    frames are `unlit` (bias frames), which have no signal that it could act on.
     """
     quiet, noisy = _by_noise(groups)
     if quiet is None or float(np.sum(quiet.covariance_dn2**2)) < THERE * quiet.error_dn2**2:
@@ -93,7 +94,7 @@ def of_read_noise(groups: Sequence[Along], read_dn2: float) -> Ringing | None:
         of_signal = growing < max(FAR_BETTER * same, same + THERE)
     else:
         near, farther = np.abs(quiet.covariance_dn2[:2])
-        of_signal = farther < FARTHER * near or farther**2 < THERE * quiet.error_dn2**2
+        of_signal = not unlit and (farther < FARTHER * near or farther**2 < THERE * quiet.error_dn2**2)
     return None if of_signal else _ringing(quiet.covariance_dn2 / read_dn2, quiet.error_dn2 / read_dn2)
 
 
