@@ -20,6 +20,7 @@ from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
+from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
@@ -63,6 +64,8 @@ class Channel:
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
         rays: hits of single frames; None if there are none.
+        banding: axis of the strongest sinusoid over rows or columns, and the sinusoid; None without one. Its variance
+            is not in `patterns`.
         jumps: pixels that jump between levels; None if there are none.
     """
 
@@ -83,6 +86,7 @@ class Channel:
     warm: Warm | None
     rays: Rays | None
     jumps: Jumps | None
+    banding: tuple[str, Banding] | None
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,14 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
+        banding=_banding(found, c),
     )
+
+
+def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
+    """The strongest sinusoid over rows or columns, and its axis: a model has one."""
+    several = [pair for plane in _shortest(found, c) for pair in plane.banding.items()]
+    return max(several, key=lambda pair: pair[1].variance_dn2, default=None)
 
 
 def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> tuple[float, float]:
@@ -269,10 +280,16 @@ def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str
     planes, out = _shortest(found, c), {}
     if not planes:
         return out
+    wave = _banding(found, c)
+    of_wave = {} if wave is None else {f"{wave[0]}_x_frame": wave[1].variance_dn2}
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
         smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
-        out[effect] = shared.variance_dn2 - smooth, shared.standard_error_dn2, shared.chance_dn2
+        out[effect] = (
+            shared.variance_dn2 - smooth - of_wave.get(component, 0.0),
+            shared.standard_error_dn2,
+            shared.chance_dn2,
+        )
     return out
 
 

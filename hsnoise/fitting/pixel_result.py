@@ -20,6 +20,7 @@ from hsnoise.effects import (
     DarkSignalNonuniformity,
     FrameOffset,
     HotPixels,
+    PeriodicBanding,
     PhotoResponseNonuniformity,
     RandomTelegraphNoise,
     ReadNoiseNonuniformity,
@@ -59,6 +60,7 @@ OF_PIXELS = (
     CorrelatedReadNoise,
     CosmicRays,
     RandomTelegraphNoise,
+    PeriodicBanding,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -147,6 +149,10 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
+    if (wave := pixel.channels[0].banding) is not None:
+        rms, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
+        error = wave[1].error_dn2 / rms
+        found["periodic_banding"] = {"amplitude": (rms / g, error / g), "frequency": (wave[1].frequency, np.inf)}
     exponents = [c.row_spectrum.exponent for c in pixel.channels]
     if "row_noise" in found:
         sigma, error = found["row_noise"]["sigma"]
@@ -314,6 +320,8 @@ def _settings(name: str, pixel: PixelFit) -> dict[str, Any]:
     """What an effect has besides numbers."""
     if name == "black_shading" and (drift := _shading(pixel)) is not None:
         return {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
+    if name == "periodic_banding" and (wave := pixel.channels[0].banding) is not None:
+        return {"axis": wave[0]}
     jumps = pixel.channels[0].jumps
     if name == "random_telegraph_noise" and jumps is not None:
         return {"double_sampling": jumps.double_sampling}

@@ -14,6 +14,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouring_rows, with_tails
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
+from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -26,6 +27,8 @@ class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
     rows_together: covariance of a row with the next, and with the next but one, in a frame.
+    banding: by axis, a sinusoid over rows or columns that moves from frame to frame; of mono frames alone, as lines of
+    every second row do not tell its frequency.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
     """
@@ -36,6 +39,7 @@ class Plane:
     frame_means_dn: np.ndarray
     components: dict[str, Component]
     rows_together: tuple[Component, Component]
+    banding: dict[str, Banding]
     halves: Halves | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
@@ -183,14 +187,14 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
         tick()
     assert kept is not None and odd is not None  # FrameStack has no empty groups
     planes = tuple(
-        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p]) for p in range(step**2)
+        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step) for p in range(step**2)
     )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     of_frames = along_rows(kept, step), tuple(Path(name).name for name in getattr(stack.counts[i], "names", ()))
     return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest
 
 
-def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
+def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plane:
     n, (h, w) = sums.n_frames, sums.shape
     halves = halves_of(counts) if n > 1 else None
     row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
@@ -202,10 +206,16 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int) -> Plane:
         frame_means_dn=sums.frame_means_dn,
         components=_components(sums, halves),
         rows_together=(of_neighbouring_rows(row_frame), of_neighbouring_rows(row_frame, 2)),
+        banding={} if step > 1 else _banding(row_frame, column_frame),
         halves=halves,
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )
+
+
+def _banding(row_frame: np.ndarray, column_frame: np.ndarray) -> dict[str, Banding]:
+    found = {"row": banding_of(row_frame), "column": banding_of(column_frame)}
+    return {axis: one for axis, one in found.items() if one is not None}
 
 
 def _components(sums: PlaneSums, halves: Halves | None) -> dict[str, Component]:
