@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
+from hsnoise.fitting.pixel_levels import growth_of_means
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -66,6 +67,7 @@ class Channel:
         rays: hits of single frames; None if there are none.
         banding: axis of the strongest sinusoid over rows or columns, and the sinusoid; None without one. Its variance
             is not in `patterns`.
+        drift: change of the black level with exposure, DN/s, and its error; infinite if there is none.
         jumps: pixels that jump between levels; None if there are none.
     """
 
@@ -87,6 +89,7 @@ class Channel:
     rays: Rays | None
     jumps: Jumps | None
     banding: tuple[str, Banding] | None
+    drift: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:
-    (growth, growth_error), black = _growth_of_means(found, c)
+    (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     jumps, jumping = jumps_of(found, c) if narrow is None else (None, None)
     floor, floor_error = _temporal(found, c, jumps) if narrow is None else _of_narrow(narrow)
@@ -167,7 +170,20 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
         banding=_banding(found, c),
+        drift=_drift(transfer, (growth, growth_error)),
     )
+
+
+def _drift(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
+    """Change of the black level, DN/s, and its error: the slope of the pedestals if they moved, or of a falling level.
+
+    growth: of the typical pixel's level, DN/s, with its error.
+    """
+    if transfer is None or not transfer.moved.any():
+        return growth if growth[0] < 0 else (0.0, np.inf)
+    t = transfer.classes.exposure_s
+    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
+    return float(slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
 
 
 def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
@@ -321,40 +337,6 @@ def _temporal(found: Survey, c: int, jumps: Jumps | None) -> tuple[float, float]
     if jumps is not None:
         mean /= jumps.raises(lambda of: without_outliers(of, group.n_frames)[0], group.n_frames)
     return mean, error
-
-
-def _growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Growth of the median pixel with exposure, DN/s, and level without signal, DN, each with its standard error."""
-    darks = found.darks
-    t = np.array([g.exposure_s for g in darks])
-    planes = [g.of(c) for g in darks]
-    level = np.array([np.mean([_level(p) for p in of]) for of in planes])
-    frames = [
-        np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
-        for of in planes
-    ]
-    scatter = np.sqrt(np.mean([of.var(ddof=1) for of in frames if len(of) > 1] or [1.0]))
-    error = np.array([max(scatter, 1e-6) / np.sqrt(len(of)) for of in frames])
-    if np.ptp(t) == 0:
-        mean_error = float(1 / np.sqrt((error**-2.0).sum()))
-        return (0.0, UNKNOWN), (float(level.mean()), mean_error if t.max() == 0 else UNKNOWN)
-    design = np.stack([np.ones_like(t), t], 1) / error[:, None]
-    covariance = np.linalg.inv(design.T @ design)
-    theta = covariance @ design.T @ (level / error)
-    left = (level - theta[0] - theta[1] * t) / error
-    covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
-    slope_error = float(np.sqrt(covariance[1, 1]))
-    # Pixels differ in growth, so the median does not grow linearly: extrapolate to 0 s from the shortest exposure.
-    shortest = int(t.argmin())
-    black = float(level[shortest] - theta[1] * t[shortest])
-    return (float(theta[1]), slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
-
-
-def _level(plane: Plane) -> float:
-    """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
-    if plane.narrow_dn is not None:  # most pixels have the same count, which is the median
-        return float(plane.row_mean_dn.mean())
-    return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 
 
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:

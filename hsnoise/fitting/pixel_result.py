@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise.effects import (
     AbstractEffect,
+    BlackLevelDrift,
     BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
@@ -61,6 +62,7 @@ OF_PIXELS = (
     CosmicRays,
     RandomTelegraphNoise,
     PeriodicBanding,
+    BlackLevelDrift,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -149,6 +151,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
+    of_level = _mean([c.drift for c in pixel.channels])
+    if abs(of_level[0]) > THERE * of_level[1]:
+        found["black_level_drift"] = {"rate": of_level}
     if (wave := pixel.channels[0].banding) is not None:
         rms, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
         error = wave[1].error_dn2 / rms

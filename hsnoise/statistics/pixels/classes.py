@@ -189,7 +189,7 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
 def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """The errors of levels [exposure], widened where the levels do not follow a non-falling straight line of exposure.
 
-    In that case pedestals jump between exposures.
+    In that case pedestals jump between exposures. The shortest keeps its error: shifts are relative to it.
     """
     weight = 1 / np.maximum(sigma, 1e-6)
     design = np.stack([np.ones_like(exposure_s), exposure_s], 1) * weight[:, None]
@@ -199,7 +199,8 @@ def _off_the_line(exposure_s: np.ndarray, level: np.ndarray, sigma: np.ndarray) 
             break
     dof = len(set(exposure_s)) - len(theta)
     chi2 = float((((level * weight) - columns @ theta) ** 2).sum()) / max(dof, 1)
-    return sigma * (np.sqrt(chi2) if dof > 0 and chi2 > JUMPS else 1.0)
+    jumps = (dof > 0 and chi2 > JUMPS) & (exposure_s > exposure_s.min())
+    return sigma * np.where(jumps, np.sqrt(chi2), 1.0)
 
 
 def _edges(growth: np.ndarray, limit: float, of_body: bool) -> np.ndarray:

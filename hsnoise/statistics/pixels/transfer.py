@@ -125,10 +125,11 @@ def pixel_transfer(classes: Classes) -> Transfer | None:
     if free is None:
         return None
     moved = np.zeros(len(sigma), bool)
+    stays = np.arange(len(sigma)) == classes.exposure_s.argmin()  # shifts are relative to the shortest exposure
     chance = max(free.chi2 / free.dof, 1.0)
-    while line.off - free.off > MOVED**2 * chance and not moved.all():
+    while line.off - free.off > MOVED**2 * chance and not (moved | stays).all():
         shift = line.theta[line.places.pedestal(np.arange(len(sigma)))]
-        worst = int(np.argmax(np.where(moved, -1.0, np.abs(shift) / np.maximum(sigma, 1e-9))))
+        worst = int(np.argmax(np.where(moved | stays, -1.0, np.abs(shift) / np.maximum(sigma, 1e-9))))
         moved[worst], sigma[worst] = True, LOOSE_DN
         line = _line(classes, sigma, alike)
     return _told(classes, line, moved)
@@ -206,6 +207,7 @@ def _told(classes: Classes, line: _Line, moved: np.ndarray) -> Transfer:
     share = classes.pixels * np.isfinite(classes.error_dn2).any(1)
     turn[1, places.common] = 1
     turn[1, places.own(np.arange(len(share)))] = share / share.sum()
+    turn[1, places.pedestal(exposures)] = t.min() * slopes  # the signal of the shortest exposure holds their slope
     turn[2, places.pedestal(exposures)] = -slopes / k
     turn[2, places.gain] = slopes @ shift / k
     ordinary = classes.pixels * ~classes.hot
