@@ -13,7 +13,6 @@ from hsnoise.effects.adc_nonuniformity import AdcNonuniformity
 from hsnoise.effects.amplifier_glow import AmplifierGlow
 from hsnoise.effects.black_clamp import BlackClamp
 from hsnoise.effects.black_level import BlackLevel
-from hsnoise.effects.black_level_drift import BlackLevelDrift
 from hsnoise.effects.black_shading import BlackShading
 from hsnoise.effects.column_fixed_pattern import ColumnFixedPattern
 from hsnoise.effects.column_noise import ColumnNoise
@@ -89,7 +88,6 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ImageLag,
     OddEvenPattern,
     TapOffsets,
-    BlackLevelDrift,
     BlackShading,
     AdcNonuniformity,
     MissingCodes,
@@ -111,7 +109,6 @@ __all__ = [
     "AmplifierGlow",
     "BlackClamp",
     "BlackLevel",
-    "BlackLevelDrift",
     "BlackShading",
     "Capture",
     "CaptureFacts",

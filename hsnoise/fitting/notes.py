@@ -180,8 +180,8 @@ def order_note(result: FitResult) -> list[str]:
         if (np.diff(level) < -1).any():
             e = int(np.diff(level).argmin())
             short, long = result.summary.exposure_s[order[[e, e + 1]]]
-            described = "black_level_drift" in result.params
-            what = " (black_level_drift)" if described else ", which this model does not describe"
+            described = "black_clamp" in result.params
+            what = " (black_clamp)" if described else ", which this model does not describe"
             return [
                 f"The mean count falls by {level[e] - level[e + 1]:.3g} DN from {short:g} s to {long:g} s: are the"
                 f" exposures right? If so, the camera subtracts its dark signal{what}."

@@ -67,7 +67,7 @@ class Channel:
         rays: hits of single frames; None if there are none.
         banding: axis of the strongest sinusoid over rows or columns, and the sinusoid; None without one. Its variance
             is not in `patterns`.
-        drift: change of the black level with exposure, DN/s, and its error; infinite if there is none.
+        subtracted: dark signal that the camera subtracts, DN/s, and its error; infinite if there is none.
         jumps: pixels that jump between levels; None if there are none.
     """
 
@@ -89,7 +89,7 @@ class Channel:
     rays: Rays | None
     jumps: Jumps | None
     banding: tuple[str, Banding] | None
-    drift: tuple[float, float]
+    subtracted: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -170,20 +170,20 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
         banding=_banding(found, c),
-        drift=_drift(transfer, (growth, growth_error)),
+        subtracted=_subtracted(transfer, (growth, growth_error)),
     )
 
 
-def _drift(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
-    """Change of the black level, DN/s, and its error: the slope of the pedestals if they moved, or of a falling level.
+def _subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
+    """Dark signal that the camera subtracts, DN/s, and its error: how fast pedestals fall if they moved, or the level.
 
     growth: of the typical pixel's level, DN/s, with its error.
     """
     if transfer is None or not transfer.moved.any():
-        return growth if growth[0] < 0 else (0.0, np.inf)
+        return (-growth[0], growth[1]) if growth[0] < 0 else (0.0, np.inf)
     t = transfer.classes.exposure_s
     slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    return float(slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
+    return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
 
 
 def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:

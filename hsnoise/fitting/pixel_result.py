@@ -11,7 +11,7 @@ import numpy as np
 
 from hsnoise.effects import (
     AbstractEffect,
-    BlackLevelDrift,
+    BlackClamp,
     BlackShading,
     ColumnFixedPattern,
     ColumnNoise,
@@ -62,7 +62,7 @@ OF_PIXELS = (
     CosmicRays,
     RandomTelegraphNoise,
     PeriodicBanding,
-    BlackLevelDrift,
+    BlackClamp,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -151,9 +151,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         noise = float(np.mean([t / g**2 for _, g, t in many_of]))
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
-    of_level = _mean([c.drift for c in pixel.channels])
-    if abs(of_level[0]) > THERE * of_level[1]:
-        found["black_level_drift"] = {"rate": of_level}
+    falls, errors = np.array([c.subtracted for c in pixel.channels]).T
+    if (falls > THERE * errors).all():
+        found["black_clamp"] = {"rate": (falls, errors)}
     if (wave := pixel.channels[0].banding) is not None:
         rms, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
         error = wave[1].error_dn2 / rms
@@ -314,7 +314,9 @@ def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: Pix
     for name in wanted:
         if name in classes:
             specs, measured = classes[name].specs(), population.get(name, {})
-            fields = {of: value if specs[of].low is None else max(value, 0.0) for of, (value, _) in measured.items()}
+            fields = {
+                of: value if specs[of].low is None else np.maximum(value, 0.0) for of, (value, _) in measured.items()
+            }
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
             fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}
             effects.append(classes[name](**fields, **_settings(name, pixel)))

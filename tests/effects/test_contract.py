@@ -21,7 +21,6 @@ from hsnoise.effects import (
     AmplifierGlow,
     BlackClamp,
     BlackLevel,
-    BlackLevelDrift,
     BlackShading,
     Capture,
     ColumnFixedPattern,
@@ -106,7 +105,6 @@ EXAMPLES = [
     ImageLag(0.1),
     OddEvenPattern(1.0, 0.02),
     TapOffsets(2.0, taps=3),
-    BlackLevelDrift(-3.0),
     BlackShading(2.0, 0.4),
     AdcNonuniformity(0.4, 8),
     MissingCodes(2.6),
@@ -132,7 +130,6 @@ DETERMINISTIC = (
     | ReadoutOvershoot
     | ImageLag
     | OddEvenPattern
-    | BlackLevelDrift
     | BlackShading
     | FrameSettling
     | MissingCodes

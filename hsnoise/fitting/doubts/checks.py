@@ -156,7 +156,7 @@ def _coupled(excess: float) -> Iterator[str]:
 def _moved_pedestals(result: FitResult) -> Iterator[str]:
     """Pedestals that moved; the gain then does not depend on them."""
     pixel = result.transfer
-    if "black_level_drift" in result.params:
+    if "black_clamp" in result.params:
         return
     for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
         t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
@@ -222,7 +222,7 @@ def _falling(result: FitResult, found: Survey) -> Iterator[str]:
     """A level that falls with exposure by more than a pixel's noise: swapped exposures, or a subtracted dark."""
     fallen = fall_of(found)
     # If single pixels grow all the same, exposures are not swapped.
-    if fallen is not None and not (result.has_gain and "black_level_drift" in result.params):
+    if fallen is not None and not (result.has_gain and "black_clamp" in result.params):
         one, other, fall = fallen
         yield (
             f"The level falls by {fall:.3g} DN from {one.exposure_s:g} s to {other.exposure_s:g} s, more than a"

@@ -1,13 +1,11 @@
-"""Cameras that subtract their mean dark signal: gain and read noise from the pixels, and the drift of the level."""
+"""Cameras that subtract their mean dark signal, pixels all different: gain, read noise and what is subtracted."""
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 
 import hsnoise
-from hsnoise import effects as fx
 from hsnoise._core.conclusion import Light
 
 EXPOSURE_S, SHAPE, FRAMES = (0.0, 5.0, 20.0), (200, 300), 8
@@ -27,23 +25,17 @@ def subtracting(share, seed=3):
 
 
 @pytest.mark.parametrize("share", [1.1, pytest.param(0.6, marks=pytest.mark.slow)])
-def test_numbers_are_those_of_the_sensor_and_the_level_drifts(share):
+def test_numbers_are_those_of_the_sensor(share):
     result = hsnoise.fit(subtracting(share))
     truth = {"gain": GAIN, "read_noise.sigma": READ_E, "dark_current.rate": DARK_E_PER_S}
-    truth["black_level_drift.rate"] = -share * GAIN * DARK_E_PER_S
+    truth["black_clamp.rate"] = share * GAIN * DARK_E_PER_S
     for name, true in truth.items():
         value, error, _ = result.table[name]
         assert abs(value - true) < 4 * error and error < 0.05 * abs(true), (name, value, error)
     assert result.conclusion.light != Light.RED
-    assert any("black_level_drift" in doubt for doubt in result.doubts) == (share > 1)
+    assert any("black_clamp" in doubt for doubt in result.doubts) == (share > 1)
     assert hsnoise.compare(result, subtracting(share), draws=8).error < 3
 
 
-def test_a_camera_that_subtracts_nothing_has_no_drift():
-    assert "black_level_drift" not in hsnoise.fit(subtracting(0.0)).added
-
-
-@pytest.mark.parametrize("exposure_s", [0.0, 2.0])
-def test_it_moves_the_level_in_proportion_to_exposure(exposure_s):
-    model = hsnoise.NoiseModel([fx.BlackLevelDrift(-3.0)], cfa="mono", shutter="global", exposure_s=exposure_s)
-    assert np.all(np.asarray(hsnoise.sample_dark(jax.random.key(1), 2, (4, 6), model)) == -3.0 * exposure_s)
+def test_a_camera_that_subtracts_nothing_has_no_clamp():
+    assert "black_clamp" not in hsnoise.fit(subtracting(0.0)).added
