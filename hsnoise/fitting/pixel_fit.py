@@ -43,6 +43,7 @@ PATTERNS = {
 }
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
+FALLS = 4.0  # standard errors of a level that falls with exposure
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
 
@@ -148,9 +149,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
-    if warm is not None:  # many warm pixels shift the median: black is the mean without their charge
-        share, extra = warm.fraction[0], warm.extra_dn[0]
-        black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)])) - share * extra, black[1]
+    if found.shortest is not None and (population is None or population.hot_fraction[0] <= 0):
+        black = _mean_black(found, c, warm, jumps, values[2]), black[1]
     return Channel(
         name=name,
         transfer=transfer,
@@ -163,7 +163,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         patterns=patterns,
         temporal_dn2=floor,
         shading=shading,
-        row_spectrum=row_spectrum(_shortest(found, c), found.shape[0]),
+        row_spectrum=row_spectrum(_shortest(found, c), found.shape[0], _wave_of(found, c, "row")),
         noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
@@ -174,13 +174,27 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     )
 
 
+def _mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None, growth: float) -> float:
+    """The mean of the shortest exposure without dark signal, warm pixels' charge and jumps, DN.
+
+    Where hot pixels have a population of their own, it is the level of the typical pixel instead.
+    """
+    black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)]))
+    black -= max(growth, 0.0) * found.shortest.exposure_s if found.has_exposures else 0.0
+    if warm is not None:
+        black -= warm.fraction[0] * warm.extra_dn[0]
+    if jumps is not None and not jumps.double_sampling:
+        black -= jumps.fraction[0] * jumps.amplitude_dn[0] * jumps.duty[0]
+    return black
+
+
 def _subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
     """Dark signal that the camera subtracts, DN/s, and its error: how fast pedestals fall if they moved, or the level.
 
     growth: of the typical pixel's level, DN/s, with its error.
     """
     if transfer is None or not transfer.moved.any():
-        return (-growth[0], growth[1]) if growth[0] < 0 else (0.0, np.inf)
+        return (-growth[0], growth[1]) if growth[0] < -FALLS * growth[1] else (0.0, np.inf)
     t = transfer.classes.exposure_s
     slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
     return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
@@ -190,6 +204,12 @@ def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
     """The strongest sinusoid over rows or columns, and its axis: a model has one."""
     several = [pair for plane in _shortest(found, c) for pair in plane.banding.items()]
     return max(several, key=lambda pair: pair[1].variance_dn2, default=None)
+
+
+def _wave_of(found: Survey, c: int, axis: str) -> Banding | None:
+    """The sinusoid that the model has, if it is over this axis."""
+    wave = _banding(found, c)
+    return None if wave is None or wave[0] != axis else wave[1]
 
 
 def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> tuple[float, float]:
@@ -296,8 +316,8 @@ def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str
     planes, out = _shortest(found, c), {}
     if not planes:
         return out
-    wave = _banding(found, c)
-    of_wave = {} if wave is None else {f"{wave[0]}_x_frame": wave[1].variance_dn2}
+    waves = {axis: _wave_of(found, c, axis) for axis in ("row", "column")}
+    of_wave = {f"{axis}_x_frame": one.variance_dn2 for axis, one in waves.items() if one is not None}
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
         smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0

@@ -43,6 +43,7 @@ from hsnoise.statistics.pixels.transfer import ROUNDING
 NOMINAL = 50.0  # relative standard error of an unknown gain
 FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
 THERE = 5.0  # standard errors above which a population effect enters the model
+SUBTRACTED = 2.0  # the same of a dark signal that is subtracted, where pedestals or levels have moved beyond chance
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
 OF_PIXELS = (
@@ -152,7 +153,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
             found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
-    if (falls > THERE * errors).all():
+    if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
     if (wave := pixel.channels[0].banding) is not None:
         rms, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of, fading_power, power_of_banks
 from hsnoise.statistics.decomposition import Component, mean_of
+from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.survey import Plane
 
 TOGETHER = 6.0  # chance deviations above which rows are not white
@@ -35,12 +37,17 @@ class RowSpectrum(NamedTuple):
 WHITE = RowSpectrum((0.0, np.inf), None, 1.0)
 
 
-def row_spectrum(planes: Sequence[Plane], rows: int) -> RowSpectrum:
-    """The spectrum from the covariance of rows of one colour's planes; rows: of the frame."""
+def row_spectrum(planes: Sequence[Plane], rows: int, wave: Banding | None = None) -> RowSpectrum:
+    """The spectrum from the covariance of rows of one colour's planes; rows: of the frame.
+
+    wave: a sinusoid over the rows of a mono sensor, which has an effect of its own.
+    """
     if not planes:
         return WHITE
     alone = mean_of([p.components["row_x_frame"] for p in planes])
     near, but_one = (mean_of([p.rows_together[lag] for p in planes]) for lag in (0, 1))
+    if wave is not None:
+        alone, near, but_one = (_without(wave, one, lag) for lag, one in enumerate((alone, near, but_one)))
     if alone.variance_dn2 <= 0:
         return WHITE
     combed = (but_one.variance_dn2 - near.variance_dn2) / np.hypot(but_one.chance_dn2, near.chance_dn2)
@@ -53,6 +60,13 @@ def row_spectrum(planes: Sequence[Plane], rows: int) -> RowSpectrum:
     exponent = _exponent(near, alone, rows, step)
     power = fading_power(rows, np.float32(exponent[0])) if banks is None else _power_of(banks, rows)
     return RowSpectrum(exponent, banks, _widened(np.array(power, float)))
+
+
+def _without(wave: Banding, of: Component, lag: int) -> Component:
+    """The covariance of rows `lag` apart without that of a sinusoid."""
+    return replace(
+        of, variance_dn2=of.variance_dn2 - wave.variance_dn2 * float(np.cos(2 * np.pi * wave.frequency * lag))
+    )
 
 
 def _exponent(near: Component, alone: Component, rows: int, step: int) -> Number:

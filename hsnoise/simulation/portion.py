@@ -16,6 +16,7 @@ from hsnoise.statistics.structure import check_size
 MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and draws slower
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
+MOST_SATURATED = 0.2  # share of a flat's pixels
 BOTH = ("dark", "flat")
 
 
@@ -53,6 +54,8 @@ class Portion:
             first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
+        bright = [i for i in range(part.n_exposures) if _is_saturated(part, i)]
+        part = part.select(exposures=[i for i in range(part.n_exposures) if i not in bright]) if bright else part
         counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
         check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
         # What depends on the place stays where it is on the sensor.
@@ -60,6 +63,8 @@ class Portion:
         left_out = []
         if single and "flat" in kinds:
             left_out.append(f"{len(single)} flats of a single frame were not compared: noise or light, nothing tells")
+        if bright:
+            left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):
@@ -78,6 +83,13 @@ class Portion:
         """Its dark exposures, where flats cannot be compared."""
         darks = self.darks
         return darks if darks is self else Portion(darks.frames, (*self.left_out, f"flats were not compared: {why}"))
+
+
+def _is_saturated(stack: FrameStack, exposure: int) -> bool:
+    """Whether so many pixels of a flat are at the white level that it shows little else."""
+    if stack.kind[exposure] != "flat" or stack.white_level is None:
+        return False
+    return float(np.mean(np.asarray(stack.counts[exposure][0]) >= stack.white_level)) > MOST_SATURATED
 
 
 def middle_of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> FrameStack:

@@ -9,7 +9,7 @@ import numpy as np
 FEWEST_FRAMES, FEWEST_LINES = 3, 64
 PADDED = 8  # lines of the spectrum for each frequency, so that none lies between two
 LEAST_PERIODS = 4  # in a frame: slower bands look like drifts
-NEAR, AROUND = 3, 30  # frequencies that belong to a line, and among which it stands out
+NEAR, AROUND = 3, 10  # frequencies that belong to a line, and among which it stands out: a hump is wider
 SHARP = 30.0  # times the power around it
 MOSTLY = 0.3  # share of what the lines of a frame vary
 
