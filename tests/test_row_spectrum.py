@@ -165,6 +165,7 @@ def test_a_share_of_one_is_a_global_shutter():
     assert rolling.table["row_gain.white_share"] == (1.0, 0.0, "1")
 
 
+@pytest.mark.slow
 def test_a_large_capture_finds_the_share_by_its_pilot(mixture, monkeypatch):
     from hsnoise.fitting import maximise
 

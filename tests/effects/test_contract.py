@@ -262,6 +262,7 @@ def test_same_key_same_draw(effect):
     assert np.array_equal(first, other) == isinstance(effect, DETERMINISTIC)
 
 
+@pytest.mark.slow  # operations one by one, each compiled by itself; models draw by compiled effects
 @each_effect
 def test_jit_is_eager(effect):
     model = model_of(effect)
@@ -289,15 +290,14 @@ def test_vmap_is_a_loop(effect):
     looped = np.stack([draw(*pair) for pair in zip(keys, scales, strict=True)])
     # Programs that are compiled apart contract products and sums differently: another last bit of float32.
     np.testing.assert_allclose(jax.vmap(draw)(keys, scales), looped, rtol=1e-7)
+    assert looped.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float64)
 
 
 @each_effect
-@pytest.mark.parametrize("x64", [False, True])
-def test_precision_follows_the_session(effect, x64):
-    expected = jnp.float64 if x64 else jnp.float32
-    with jax.enable_x64(x64):
+def test_precision_follows_the_session(effect):
+    with jax.enable_x64(False):
         drawn = sample(KEY, signal(), model_of(effect))  # the example's own parameters are float64
-        assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else expected)
+        assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float32)
         assert np.all(np.isfinite(drawn))
 
 
