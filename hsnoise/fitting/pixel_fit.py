@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
-from hsnoise.fitting.pixel_levels import growth_of_means
+from hsnoise.fitting.pixel_levels import growth_of_means, mean_black, subtracted
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -43,7 +43,7 @@ PATTERNS = {
 }
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
-FALLS = 4.0  # standard errors of a level that falls with exposure
+UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
 
@@ -139,6 +139,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if transfer is not None and pixels is not None:
         values, covariance = transfer.values.copy(), transfer.covariance.copy()
+        if jumps is not None:
+            _correct(values, covariance, jumps, found.shortest.n_frames)
         population = _population(found, c, pixels, transfer)
         values[2] = population.mean
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
@@ -150,7 +152,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     if found.shortest is not None and (population is None or population.hot_fraction[0] <= 0):
-        black = _mean_black(found, c, warm, jumps, values[2]), black[1]
+        black = mean_black(found, c, warm, jumps, values[2]), black[1]
     return Channel(
         name=name,
         transfer=transfer,
@@ -170,34 +172,17 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
         banding=_banding(found, c),
-        subtracted=_subtracted(transfer, (growth, growth_error)),
+        subtracted=subtracted(transfer, (growth, growth_error)),
     )
 
 
-def _mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None, growth: float) -> float:
-    """The mean of the shortest exposure without dark signal, warm pixels' charge and jumps, DN.
-
-    Where hot pixels have a population of their own, it is the level of the typical pixel instead.
-    """
-    black = float(np.mean([p.row_mean_dn.mean() for p in _shortest(found, c)]))
-    black -= max(growth, 0.0) * found.shortest.exposure_s if found.has_exposures else 0.0
-    if warm is not None:
-        black -= warm.fraction[0] * warm.extra_dn[0]
-    if jumps is not None and not jumps.double_sampling:
-        black -= jumps.fraction[0] * jumps.amplitude_dn[0] * jumps.duty[0]
-    return black
-
-
-def _subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
-    """Dark signal that the camera subtracts, DN/s, and its error: how fast pedestals fall if they moved, or the level.
-
-    growth: of the typical pixel's level, DN/s, with its error.
-    """
-    if transfer is None or not transfer.moved.any():
-        return (-growth[0], growth[1]) if growth[0] < -FALLS * growth[1] else (0.0, np.inf)
-    t = transfer.classes.exposure_s
-    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
+def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, n_frames: int) -> None:
+    """Adds the noise of the pixels that were left out, and to the errors half of it, and what unseen jumps may add."""
+    more = (jumps.cut - 1) * max(values[1] - ROUNDING, 0.0)
+    values[1] += more
+    covariance[1, 1] += (more / 2) ** 2
+    raised = jumps.raises(lambda of: without_outliers(of, n_frames)[0], n_frames) - 1
+    covariance[0, 0] += (UNSEEN * raised * values[0]) ** 2
 
 
 def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
@@ -321,10 +306,12 @@ def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
         smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
+        # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
+        of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
         out[effect] = (
             shared.variance_dn2 - smooth - of_wave.get(component, 0.0),
             shared.standard_error_dn2,
-            shared.chance_dn2,
+            float(np.hypot(shared.chance_dn2, of_mean)),
         )
     return out
 

@@ -1,11 +1,16 @@
-"""Growth of the typical pixel's level with exposure, and the level without signal."""
+"""Levels over exposure: growth of the typical pixel, the level without signal, what the camera subtracts."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import UNKNOWN
+from hsnoise.statistics.pixels.jump_search import Jumps
+from hsnoise.statistics.pixels.population import Warm
 from hsnoise.statistics.pixels.survey import Plane, Survey
+from hsnoise.statistics.pixels.transfer import Transfer
+
+FALLS = 4.0  # standard errors of a level that falls with exposure
 
 
 def growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -40,3 +45,29 @@ def _level(plane: Plane) -> float:
     if plane.narrow_dn is not None:  # most pixels have the same count, which is the median
         return float(plane.row_mean_dn.mean())
     return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
+
+
+def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None, growth: float) -> float:
+    """The mean of the shortest exposure without dark signal, warm pixels' charge and jumps, DN.
+
+    Where hot pixels have a population of their own, it is the level of the typical pixel instead.
+    """
+    black = float(np.mean([p.row_mean_dn.mean() for p in found.shortest.of(c)]))
+    black -= max(growth, 0.0) * found.shortest.exposure_s if found.has_exposures else 0.0
+    if warm is not None:
+        black -= warm.fraction[0] * warm.extra_dn[0]
+    if jumps is not None and not jumps.double_sampling:
+        black -= jumps.fraction[0] * jumps.amplitude_dn[0] * jumps.duty[0]
+    return black
+
+
+def subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[float, float]:
+    """Dark signal that the camera subtracts, DN/s, and its error: how fast pedestals fall if they moved, or the level.
+
+    growth: of the typical pixel's level, DN/s, with its error.
+    """
+    if transfer is None or not transfer.moved.any():
+        return (-growth[0], growth[1]) if growth[0] < -FALLS * growth[1] else (0.0, np.inf)
+    t = transfer.classes.exposure_s
+    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
+    return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))

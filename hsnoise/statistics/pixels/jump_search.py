@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 DRAWN, ORDINARY = 6000, 40_000  # pixels with a trap, and without
 CORE, WIDTH = 16, 0.2  # bins of the variance of pixels that are not noisy; the last has no end
 STEP, FEWEST_IN_BIN = 1.25, 30  # ratio of the variances that bound a bin; pixels above the last
-ALIKE = 0.05  # relative error of a statistic: no two traps are alike
+ALIKE = 0.1  # relative error of a statistic: no two traps are alike
 STARTS = (2.5, 5.0)  # amplitudes in units of the noise, beyond a count
 STEPS = np.array([0.2, 0.2, 0.04, 0.04])  # of ln fraction, ln amplitude, duty, and spread of ln noise over pixels
 # Less than the noise would explain the few by jumps of most pixels that nobody sees.
@@ -28,7 +28,9 @@ class Jumps(NamedTuple):
     """Jumping pixels as `random_telegraph_noise` has them, each number with its error; the amplitude in DN.
 
     exponential: whether amplitudes are exponential over pixels (a spread of 1), or all alike (0); between the two,
-    only the product of fraction and amplitude would show. noise_dn2: variance of an ordinary pixel, rounding included.
+    only the product of fraction and amplitude would show. noise_spread: standard deviation of the logarithm of the
+    noise over pixels. noise_dn2: variance of an ordinary pixel, rounding included. cut: mean variance of all ordinary
+    pixels over that of those that pass for ordinary, as the noisiest look as if they jumped.
     """
 
     fraction: Number
@@ -38,6 +40,7 @@ class Jumps(NamedTuple):
     exponential: bool
     noise_spread: Number
     noise_dn2: float
+    cut: float = 1.0
 
     def of_traps(self, states: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Jumps of pixels that all have a trap [frame, pixel], in units of the noise.
@@ -165,6 +168,13 @@ class Chance:
             dof=dof,
         )
 
+    def of_ordinary(self, spread: float) -> tuple[np.ndarray, Moments]:
+        """True and measured variances of pixels that do not jump; their shapes are left open."""
+        noise = np.exp(2 * spread * self.strength)
+        halves = noise * self.squares
+        variance = self.dof @ halves / self.dof.sum()
+        return noise, Moments(variance, halves[:2], *[np.zeros_like(variance)] * 2)
+
 
 @dataclass(frozen=True)
 class Search:
@@ -191,10 +201,7 @@ class Search:
 
         @lru_cache(maxsize=8)
         def ordinary(spread: float) -> Bins:
-            halves = np.exp(2 * spread * chance.strength) * chance.squares
-            variance = chance.dof @ halves / chance.dof.sum()
-            nothing = np.zeros_like(variance)
-            return Bins.of(Moments(variance, halves[:2], nothing, nothing), limits, edges)
+            return Bins.of(chance.of_ordinary(spread)[1], limits, edges)
 
         return cls(Bins.of(pixels, limits, edges), edges, limits, noise_dn2, chance, normal, ordinary)
 
@@ -239,7 +246,11 @@ class Search:
         worse = max(1.0, 2 * end.cost / max(len(end.fun) - len(end.x), 1))
         covariance = worse * np.linalg.inv(end.jac.T @ end.jac + 1e-6 * np.eye(len(end.x)))
         jumps = self._at(end.x, np.sqrt(np.diagonal(covariance)), kind)
-        return jumps, float(np.sum(self.off(jumps)[1] ** 2))
+        return jumps._replace(cut=self._cut(jumps)), float(np.sum(self.off(jumps)[1] ** 2))
+
+    def _cut(self, of: Jumps) -> float:
+        noise, pixels = self.chance.of_ordinary(of.noise_spread[0])
+        return float(noise.mean() / noise[~pixels.is_noisy(self.limits)].mean())
 
     def _nearest(self, kind: tuple[bool, bool], start: np.ndarray, tries: int):
         """The kind, and the end of a search."""

@@ -86,14 +86,16 @@ def population_of(
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[2:], errors[2:] = 0.0, np.inf
     body, spread, fraction, rate, tail = values
-    # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
-    cut = _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
-    beyond = body - cut if spread > 0 or fraction > 0 else 0.0
+    below = float(growth[growth < limit - pedestal_dn_per_s].mean())
+    if fraction > 0:
+        # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
+        beyond = body - _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
+    else:
+        beyond = float(growth.mean()) - below if spread > 0 else 0.0
     mean = ordinary + beyond
     if fraction > 0:  # keeps the charge of the tail, whatever its shape; moving pedestals are in both means
         total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
-        measured = float(growth[growth < limit - pedestal_dn_per_s].mean()) + beyond
-        rate = max((total - measured) / fraction, 0.0)
+        rate = max((total - below - beyond) / fraction, 0.0)
         errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
     shortest = float(pixels.exposure_s.min())
     return Population(

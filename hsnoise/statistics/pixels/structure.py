@@ -41,7 +41,9 @@ def static_of(found: Survey, group: Group, channel: int) -> Static | None:
         products.append(covariance_terms(pattern))
         temporal.append(float(np.median(plane.halves.pair_variance_dn2)))
     terms = np.concatenate(products)
-    noise = np.mean([p.components["temporal"].variance_dn2 for p in planes])
+    # Of the typical pixel, where hits in a few make up the mean; of few frames, the median lies below it.
+    share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
+    noise = min(np.mean([p.components["temporal"].variance_dn2 for p in planes]), np.mean(temporal) / share)
     return Static(float(terms.mean()), float(terms.std() / np.sqrt(len(terms))), float(noise))
 
 
