@@ -33,8 +33,18 @@ def closing_notes(result: FitResult) -> tuple[str, ...]:
 
 def pixel_notes(result: FitResult) -> tuple[str, ...]:
     """Notes under the table of a pixel-conditional fit, which has no histogram of pooled pixels."""
-    circumstances = (note(result) for note in (order_note, _warming_note, _light_note))
+    circumstances = (note(result) for note in (order_note, _warming_note, _light_note, _settings_note))
     return (*parameter_notes(result), *chain.from_iterable(circumstances))
+
+
+def _settings_note(result: FitResult) -> list[str]:
+    """What measured effects have besides numbers: axes, sides, kinds."""
+    of = [
+        f"{name} " + ", ".join(f"{field} {value}" for field, value in settings.items())
+        for name in result.added
+        if (settings := {k: v for k, v in result.params[name].settings().items() if v != "" and v is not False})
+    ]
+    return [f"Besides the numbers of the table: {'; '.join(of)} (docs/effects.md)."] if of else []
 
 
 def parameter_notes(result: FitResult) -> list[str]:
