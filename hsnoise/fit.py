@@ -110,6 +110,8 @@ def fit(
     found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
     measurable = found is not None and (model is None or "black_clamp" not in model)
     differ = measurable and _is_conditional(found, method, pixels)
+    if extra and measurable and not differ and pixels == "auto":  # what single pixels tell is not to be simulated
+        differ = carries_no_gain(Evidence(found, _summary_of(source, progress)), method)
     simulated = tuple(name for name in extra if not (differ and name in POPULATION))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)

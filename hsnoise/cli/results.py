@@ -92,7 +92,7 @@ def write_results(fit: FitResult, out: Path, source: dict[str, Any], figures: bo
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["parameter", "value", "standard_error", "unit"])
     # 0: held, not fitted; inf: not determined.
-    writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.table.items())
+    writer.writerows([name, value, error, unit] for name, (value, error, unit) in fit.shown.items())
     write_atomically(out / "table.csv", text.getvalue().encode())
     drawings = plots.of_fit(fit) if figures else {}
     for name, figure in drawings.items():

@@ -26,6 +26,8 @@ from hsnoise.likelihood.summary import Summary, without_counts
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
 
+MOST_ERROR_DN = 1e5  # of a value that is shown: beyond, nothing is known of it
+
 
 class Method(StrEnum):
     """The method of a fit."""
@@ -189,11 +191,30 @@ class FitResult:
         found = self.rows_of(effect)
         if self.has_gain:
             return found
-        gain, fitted = float(np.mean(np.asarray(self.params["gain"].value))), self._rows
         for name in found.keys() & set(self.withheld):
-            value, error, unit = fitted[name]
-            found[name] = (value * gain, error * gain, unit.replace("e-", "DN"))
+            found[name] = self._times_gain(name)
         return found
+
+    def _times_gain(self, name: str) -> tuple[float, float, str]:
+        """A row in DN, by the gain that `params` has; what depends on the gain is known better in DN."""
+        gain, (value, error, unit) = float(np.mean(np.asarray(self.params["gain"].value))), self._rows[name]
+        slope = np.zeros(len(self.names))
+        gains = [i for i, one in enumerate(self.names) if one in self.rows_of("gain")]
+        if name in self.names and self.covariance[self.names.index(name), gains].any():
+            slope[gains] = value / len(gains)
+            slope[self.names.index(name)] = gain
+            error = float(np.sqrt(max(slope @ self.covariance @ slope, 0.0))) / gain
+        return value * gain, error * gain, unit.replace("e-", "DN")
+
+    @property
+    def shown(self) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table` as they are printed: without a gain, single pixels still tell electrons as DN."""
+        rows = self.table
+        if self.has_gain or self.transfer is None:
+            return rows
+        in_e = [name for name in self.withheld if name in rows and rows[name][2] in ("e-", "e-/s")]
+        in_dn = {name: self._times_gain(name) for name in in_e}
+        return rows | {name: row for name, row in in_dn.items() if row[1] < MOST_ERROR_DN}
 
     @property
     def outcome(self) -> str:
@@ -258,7 +279,7 @@ class FitResult:
         table = Table()
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-        for name, (value, error, unit) in self.table.items():
+        for name, (value, error, unit) in self.shown.items():
             table.add_row(name, *rounded(value, error), unit_in_words(unit))
         return table
 

@@ -50,10 +50,12 @@ def _best(pixels: Moments, limits: np.ndarray, frames: list[int], typical_dn2: f
     noise_dn2 = typical_dn2
     for _ in range(ROUNDS):
         search = Search.of(pixels, limits, frames, noise_dn2)
+        normal = search.misfit_of_normal()
+        if normal < FAILS * search.normal.size:
+            return None
         best, misfit = search.best()
         is_sure = all(value > SURE * error for value, error in (best.fraction, best.amplitude_dn))
-        normal = search.misfit_of_normal()
-        if not is_sure or normal < FAILS * search.normal.size or misfit > FAR_BETTER * normal:
+        if not is_sure or misfit > FAR_BETTER * normal:
             return None
         if best.fraction[0] < MANY:
             break
