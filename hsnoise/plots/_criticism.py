@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +19,8 @@ BAR, ALARM = COLOURS["B"], COLOURS["R"]
 ALARM_AT, NOTABLE_Z = 2.0, 4.0  # as in the words of compare and on the page of report
 MOST_TICKS = 3  # to either side of 0
 MOST_LINES = 30  # powers of ten that each get a grid line
-LETTER = 0.009  # width of a letter, as a share of a story's longest bar
+MOST_LETTERS = 34  # of a line of a model's name
+LETTER = 0.0105  # width of a letter, as a share of a story's longest bar
 LEAST_MISFIT = 0.1  # at the left end of the bars
 
 
@@ -87,13 +90,14 @@ def story(found) -> Figure:
     Args:
         found: result of `hsnoise.improve`.
     """
-    names = [found.start, *(f"+ {step.added}" for step in found.steps[1:])]
+    names = [textwrap.fill(found.start, MOST_LETTERS), *(f"+ {step.added}" for step in found.steps[1:])]
     seen = [step.comparison for step in found.steps]
     if found.closed is not None:
         names.append("closed with\nmeasured components")
         seen.append(found.closed.comparison)
     steps = [parts_of(comparison) for comparison in seen]
-    figure = new_figure(10.0, 0.42 * len(names) + 1.9, "Misfit of the model, step by step")
+    more_lines = sum(name.count("\n") for name in names)
+    figure = new_figure(10.0, 0.42 * len(names) + 0.16 * more_lines + 1.9, "Misfit of the model, step by step")
     axes = figure.subplots()
     longest = max(1.0, *(sum(part.decades for part in parts) for parts in steps))
     for y, (parts, comparison) in enumerate(zip(steps, seen, strict=True)):
