@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
-from hsnoise.fitting.pixel_levels import growth_of_means, mean_black, subtracted
+from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -151,8 +151,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
-    if found.shortest is not None and (population is None or population.hot_fraction[0] <= 0):
-        black = mean_black(found, c, warm, jumps, values[2]), black[1]
+    if is_unlit(found, max(growth, values[2])) and (population is None or population.hot_fraction[0] <= 0):
+        black = mean_black(found, c, warm, jumps), black[1]
     return Channel(
         name=name,
         transfer=transfer,

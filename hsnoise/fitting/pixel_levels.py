@@ -10,6 +10,7 @@ from hsnoise.statistics.pixels.population import Warm
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.transfer import Transfer
 
+LITTLE_DN = 0.02  # dark signal that does not matter for a level
 FALLS = 4.0  # standard errors of a level that falls with exposure
 
 
@@ -47,13 +48,21 @@ def _level(plane: Plane) -> float:
     return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 
 
-def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None, growth: float) -> float:
-    """The mean of the shortest exposure without dark signal, warm pixels' charge and jumps, DN.
+def is_unlit(found: Survey, growth: float) -> bool:
+    """Whether the shortest exposure hardly has dark signal, so that its mean is the level without signal.
+
+    growth: DN/s.
+    """
+    group = found.shortest
+    return group is not None and (not found.has_exposures or growth * group.exposure_s < LITTLE_DN)
+
+
+def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None) -> float:
+    """The mean of the shortest exposure without warm pixels' charge and jumps, DN.
 
     Where hot pixels have a population of their own, it is the level of the typical pixel instead.
     """
     black = float(np.mean([p.row_mean_dn.mean() for p in found.shortest.of(c)]))
-    black -= max(growth, 0.0) * found.shortest.exposure_s if found.has_exposures else 0.0
     if warm is not None:
         black -= warm.fraction[0] * warm.extra_dn[0]
     if jumps is not None and not jumps.double_sampling:
