@@ -362,11 +362,12 @@ def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
     error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
     if len(groups) < 2 or np.ptp(signal) <= 0:
         return 0.0, UNKNOWN
-    design = np.stack([np.ones_like(signal), signal**2], 1) / error[:, None]
+    unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse
+    design = np.stack([np.ones_like(signal), (signal / unit) ** 2], 1) / error[:, None]
     covariance = np.linalg.pinv(design.T @ design)
     theta = covariance @ design.T @ (y / error)
-    error_of_gain = float(np.sqrt(covariance[1, 1]))
-    return (float(theta[1]), error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
+    error_of_gain = float(np.sqrt(covariance[1, 1])) / unit**2
+    return (float(theta[1]) / unit**2, error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
