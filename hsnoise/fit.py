@@ -110,18 +110,21 @@ def fit(
     found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
     measurable = found is not None and (model is None or "black_clamp" not in model)
     differ = measurable and _is_conditional(found, method, pixels)
-    if extra and measurable and not differ and pixels == "auto":  # what single pixels tell is not to be simulated
-        differ = carries_no_gain(Evidence(found, _summary_of(source, progress)), method)
+    seen = None
+    if measurable and not differ and pixels == "auto" and any(name in POPULATION for name in extra):
+        seen = Evidence(found, _summary_of(source, progress))
+        differ = carries_no_gain(seen, method)  # what single pixels tell is not to be simulated
     simulated = tuple(name for name in extra if not (differ and name in POPULATION))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
         return _ended(result if found is None else checked(result, Evidence(found, result.summary)))
     if model is not None:
         _check_complete(model)
-    summary = source if isinstance(source, Summary) else _summary_of(source, progress)
     if found is None:
+        summary = source if isinstance(source, Summary) else _summary_of(source, progress)
         return _ended(_pooled(summary, model, method))
-    seen = Evidence(found, summary)
+    seen = seen or Evidence(found, _summary_of(source, progress))
+    summary = seen.summary
     if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
         log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they show no gain")
         return _ended(checked(result_of(seen.measured(_all_of(source, found)), summary, model, source), seen))

@@ -131,7 +131,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     jumps, jumping = jumps_of(found, c) if narrow is None else (None, None)
-    floor, floor_error = _temporal(found, c, jumps) if narrow is None else _of_narrow(narrow)
+    raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
+    floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
     # Rounding, not light, sets the variance of narrow noise.
     pixels = levels_of(found, c, without=jumping) if narrow is None else None
     transfer = None if pixels is None else _transfer(pixels, found, _row_gain(found, c, growth))
@@ -140,7 +141,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     if transfer is not None and pixels is not None:
         values, covariance = transfer.values.copy(), transfer.covariance.copy()
         if jumps is not None:
-            _correct(values, covariance, jumps, found.shortest.n_frames)
+            _correct(values, covariance, jumps, raised)
         population = _population(found, c, pixels, transfer)
         values[2] = population.mean
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
@@ -151,6 +152,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     patterns = _patterns(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
+    # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
     if is_unlit(found, max(growth, values[2])) and (population is None or population.hot_fraction[0] <= 0):
         black = mean_black(found, c, warm, jumps), black[1]
     return Channel(
@@ -176,13 +178,17 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     )
 
 
-def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, n_frames: int) -> None:
+def _raised_by(jumps: Jumps, n_frames: int) -> float:
+    """Factor by which jumping pixels that are no outliers raise the mean variance over so many frames."""
+    return jumps.raises(lambda variances: without_outliers(variances, n_frames)[0], n_frames)
+
+
+def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, raised: float) -> None:
     """Adds the noise of the pixels that were left out, and to the errors half of it, and what unseen jumps may add."""
     more = (jumps.cut - 1) * max(values[1] - ROUNDING, 0.0)
     values[1] += more
     covariance[1, 1] += (more / 2) ** 2
-    raised = jumps.raises(lambda of: without_outliers(of, n_frames)[0], n_frames) - 1
-    covariance[0, 0] += (UNSEEN * raised * values[0]) ** 2
+    covariance[0, 0] += (UNSEEN * (raised - 1) * values[0]) ** 2
 
 
 def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
@@ -328,10 +334,10 @@ def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
     return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
-def _temporal(found: Survey, c: int, jumps: Jumps | None) -> tuple[float, float]:
+def _temporal(found: Survey, c: int, raised: float) -> tuple[float, float]:
     """Temporal variance of the pixels at the shortest exposure, DN^2, without outliers, and its standard error.
 
-    What jumping pixels that are no outliers add to it is taken off.
+    raised: factor by which jumping pixels that are no outliers raise it.
     """
     group = found.shortest
     if group is None:
@@ -341,9 +347,7 @@ def _temporal(found: Survey, c: int, jumps: Jumps | None) -> tuple[float, float]
     if not (variance > 0).any():
         return 0.0, UNKNOWN
     mean, error = without_outliers(variance, group.n_frames)
-    if jumps is not None:
-        mean /= jumps.raises(lambda of: without_outliers(of, group.n_frames)[0], group.n_frames)
-    return mean, error
+    return mean / raised, error
 
 
 def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:

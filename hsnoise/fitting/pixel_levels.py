@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import UNKNOWN
+from hsnoise.statistics.pixels.classes import slope_over
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.population import Warm
 from hsnoise.statistics.pixels.survey import Plane, Survey
@@ -58,10 +59,7 @@ def is_unlit(found: Survey, growth: float) -> bool:
 
 
 def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None) -> float:
-    """The mean of the shortest exposure without warm pixels' charge and jumps, DN.
-
-    Where hot pixels have a population of their own, it is the level of the typical pixel instead.
-    """
+    """The mean of the shortest exposure without warm pixels' charge and jumps, DN."""
     black = float(np.mean([p.row_mean_dn.mean() for p in found.shortest.of(c)]))
     if warm is not None:
         black -= warm.fraction[0] * warm.extra_dn[0]
@@ -77,6 +75,5 @@ def subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[
     """
     if transfer is None or not transfer.moved.any():
         return (-growth[0], growth[1]) if growth[0] < -FALLS * growth[1] else (0.0, np.inf)
-    t = transfer.classes.exposure_s
-    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
+    slopes = slope_over(transfer.classes.exposure_s, np.eye(len(transfer.pedestal_dn)))
     return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))

@@ -156,9 +156,9 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
     if (wave := pixel.channels[0].banding) is not None:
-        rms, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
-        error = wave[1].error_dn2 / rms
-        found["periodic_banding"] = {"amplitude": (rms / g, error / g), "frequency": (wave[1].frequency, np.inf)}
+        amplitude, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
+        size = amplitude / g, wave[1].error_dn2 / amplitude / g
+        found["periodic_banding"] = {"amplitude": size, "frequency": (wave[1].frequency, np.inf)}
     exponents = [c.row_spectrum.exponent for c in pixel.channels]
     if "row_noise" in found:
         sigma, error = found["row_noise"]["sigma"]

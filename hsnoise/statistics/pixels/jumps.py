@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from hsnoise.statistics.pixels.classes import is_hot
 from hsnoise.statistics.pixels.jump_search import Jumps, Moments, Search
+from hsnoise.statistics.pixels.sample import median_share
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 ALIKE = 1.15  # factor of the least typical variance up to which exposures have the same noise
@@ -69,8 +70,7 @@ def _median(variances: np.ndarray) -> float:
 
 def _typical(group: Group, channel: int, kept: np.ndarray) -> float:
     """Temporal variance of the typical pixel, DN^2; of few frames the median lies below it."""
-    dof = group.n_frames - 1
-    return float(np.median(group.pixels(channel, "pair_variance_dn2")[kept])) * dof / float(chi2.median(dof))
+    return float(np.median(group.pixels(channel, "pair_variance_dn2")[kept])) / median_share(group.n_frames)
 
 
 def _alike(groups: Sequence[Group], channel: int, kept: np.ndarray) -> list[Group]:

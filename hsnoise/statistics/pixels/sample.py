@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hsnoise.statistics.apart import typical_offset
 from hsnoise.statistics.pixels.hits import Hits, hits_of
@@ -64,6 +65,11 @@ class Halves:
 def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
     """Covariance over pixels of two halves of the frames [pixel]: free of the noise of estimation."""
     return float(((a - a.mean()) * (b - b.mean())).mean())
+
+
+def median_share(n_frames: int) -> float:
+    """Median over mean of the variances over so many frames of pixels that are alike."""
+    return float(chi2.median(n_frames - 1)) / (n_frames - 1)
 
 
 def without_outliers(variance: np.ndarray, n_frames: int) -> tuple[float, float]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from hsnoise.statistics.pixels.classes import HOT_SIGMAS
-from hsnoise.statistics.pixels.sample import covariance_of
+from hsnoise.statistics.pixels.sample import covariance_of, median_share
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
@@ -42,8 +41,8 @@ def static_of(found: Survey, group: Group, channel: int) -> Static | None:
         temporal.append(float(np.median(plane.halves.pair_variance_dn2)))
     terms = np.concatenate(products)
     # Of the typical pixel, where hits in a few make up the mean; of few frames, the median lies below it.
-    share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
-    noise = min(np.mean([p.components["temporal"].variance_dn2 for p in planes]), np.mean(temporal) / share)
+    typical_dn2 = np.mean(temporal) / median_share(group.n_frames)
+    noise = min(np.mean([p.components["temporal"].variance_dn2 for p in planes]), typical_dn2)
     return Static(float(terms.mean()), float(terms.std() / np.sqrt(len(terms))), float(noise))
 
 
@@ -108,7 +107,7 @@ def variance_grows(found: Survey) -> bool:
             middle = float(np.median(variance))
             width = 1.4826 * float(np.median(np.abs(variance - middle)))
             # With few frames the median lies below the mean, by the same factor for all pixels.
-            share = float(chi2.median(group.n_frames - 1)) / (group.n_frames - 1)
+            share = median_share(group.n_frames)
             ends.append((middle / share, 1.25 * width / share / np.sqrt(len(variance))))
         (low, low_error), (high, high_error) = ends
         if high - low > max(SIGNIFICANT * np.hypot(low_error, high_error), GROWN * low):
