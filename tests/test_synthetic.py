@@ -44,6 +44,18 @@ def test_errors_of_right_weights_stay(held):
     assert growth_of_errors(np.eye(STATISTICS), np.array([held, 0.0, 0.0])) == pytest.approx(1.0, abs=0.1)
 
 
+def test_errors_of_few_draws_cover():
+    """Pulls of estimates that scatter as the draws do, with the mean of such draws for their expectation."""
+    claimed, gain, prior = linear_fit(np.zeros(NUMBERS))
+    within = []
+    for seed in range(1000):
+        few = np.random.default_rng(seed).standard_normal((10, STATISTICS))
+        error = np.sqrt(np.diagonal(as_scattered(claimed, gain, prior, few - few.mean(0))))
+        measured = np.random.default_rng(10_000 + seed).standard_normal(STATISTICS)
+        within.append(np.abs(claimed @ gain @ (measured - few.mean(0))) < 1.96 * error)
+    assert np.mean(within) == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / 3000))
+
+
 def test_errors_of_weights_that_hide_a_correlation_are_widened():
     together = SLOPES[:, 0] / np.linalg.norm(SLOPES[:, 0])
     true = np.eye(STATISTICS) + 8.0 * np.outer(together, together)  # the first number's own direction scatters thrice

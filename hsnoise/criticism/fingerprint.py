@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.criticism.candidates import made
 from hsnoise.effects import Maker
-from hsnoise.likelihood.parameters import read_noise_dn
+from hsnoise.likelihood.parameters import Number, numbers_of, read_noise_dn
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import Gaussian
 from hsnoise.simulation.reference import Reference
@@ -20,7 +20,9 @@ NEARBY_ERROR = 0.02  # of a shift drawn with parameters brought close to the cap
 SLOPE_DRAWS = 2
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many such steps it may be off
 FAR_REACH = 30.0  # likewise, of the row gain: another kind of row noise can pass for a row gain where there is none
-BASE = {"gain": "value", "dark_current": "rate", "read_noise": "sigma", "row_gain": "sigma", "black_level": "value"}
+SPECTRUM_STEP = 0.05  # of the exponent and the white share of the row gain
+BASE = (("gain", "value"), ("dark_current", "rate"), ("read_noise", "sigma"), ("row_gain", "sigma"))
+LEVEL, SPECTRUM = ("black_level", "value"), (("row_gain", "exponent"), ("row_gain", "white_share"))
 
 
 @dataclass(frozen=True)
@@ -121,23 +123,21 @@ class Bench:
         return (self.simulator.drawn(wanted) - self.base.draws[numbers]) / self.base.deviation
 
 
+def base_numbers(model: NoiseModel) -> list[Number]:
+    """The numbers of the base model that may be wrong: a refit would move them."""
+    places = (*BASE, LEVEL, *(SPECTRUM if model.shutter == "rolling" else ()))
+    own = [n for n in numbers_of(model) if n.place in places]
+    return [n for n in own if not n.spec.holds(n.value_in(model))]
+
+
 def _moved_models(model: NoiseModel) -> list[tuple[NoiseModel, float]]:
     """For each base parameter: the model with it a little off, and how many such steps it may be off."""
     models = []
-    for name, what in BASE.items():
-        if name not in model:
-            continue
-        value = np.asarray(getattr(model[name], what), float)
+    for number in base_numbers(model):
+        value = number.value_in(model)
         # A black level is off by a share of the noise, not of itself.
-        steps = np.full(value.shape, 0.5 * STEP * read_noise_dn(model)) if name == "black_level" else STEP * value
-        for i in np.ndindex(value.shape):
-            changed = value.copy()
-            changed[i] += steps[i]
-            models.append((model.with_value(name, what, changed), FAR_REACH if name == "row_gain" else REACH))
-    if "row_gain" in model and model.shutter == "rolling":
-        moved = model.with_value("row_gain", "exponent", np.asarray(model["row_gain"].exponent) + 0.05)
-        models.append((moved, REACH))
-        share = float(model["row_gain"].white_share)
-        if 0 < share < 1:
-            models.append((model.with_value("row_gain", "white_share", min(share + 0.05, 1.0)), REACH))
+        step = 0.5 * STEP * read_noise_dn(model) if number.place == LEVEL else STEP * value
+        step = SPECTRUM_STEP if number.place in SPECTRUM else step
+        reach = FAR_REACH if number.place == ("row_gain", "sigma") else REACH
+        models.append((number.put_in(model, min(value + step, number.bounds[1])), reach))
     return models

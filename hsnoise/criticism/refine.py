@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.criticism.fingerprint import BASE, NEARBY_ERROR, RELATIVE_ERROR, Bench, distribution_of
+from hsnoise.criticism.fingerprint import LEVEL, NEARBY_ERROR, RELATIVE_ERROR, Bench, base_numbers, distribution_of
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
-from hsnoise.likelihood.parameters import Number, Parameters, numbers_of, of_numbers, parameters_of, read_noise_dn
+from hsnoise.likelihood.parameters import Number, Parameters, of_numbers, parameters_of, read_noise_dn
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.gaussian import Gaussian, share_of_far
 
@@ -84,7 +84,7 @@ def with_base(effect: AbstractEffect, bench: Bench, evidence: Evidence) -> WithB
     """
     own = bench.base.distribution.covariance
     model = bench.model.add(effect)
-    of_effect, of_base = parameters_of(model, (effect.name,)).numbers, _base_numbers(model)
+    of_effect, of_base = parameters_of(model, (effect.name,)).numbers, _free_base(model)
     prior = np.array([PRIOR_SIGMA] * len(of_effect) + [_base_sigma(n, model) for n in of_base]) ** -2
     turned = of_numbers(model, (*of_effect, *of_base))
     slopes = np.concatenate(
@@ -121,19 +121,18 @@ def _nearby(shifts: np.ndarray, own: np.ndarray) -> Gaussian:
     return Gaussian(mean, own * (1 + 1 / len(shifts)) + np.diag((NEARBY_ERROR * mean) ** 2))
 
 
-def _base_numbers(model: NoiseModel) -> list[Number]:
-    """The base parameters, without sizes that are zero.
+def _free_base(model: NoiseModel) -> list[Number]:
+    """The base parameters that move with an effect, without sizes that are zero.
 
     A black level that stays where the fit left it, or an exponent of the row gain, would hold the others.
     """
-    moved = {*BASE.items(), *([("row_gain", "exponent")] if model.shutter == "rolling" else ())}
-    numbers = [n for n in numbers_of(model, [name for name in BASE if name in model]) if n.place in moved]
+    numbers = [n for n in base_numbers(model) if n.field != "white_share"]
     return [n for n in numbers if n.spec.low is None or n.value_in(model) > TINY]
 
 
 def _base_sigma(number: Number, model: NoiseModel) -> float:
     """Prior standard deviation of a base parameter's coordinate."""
-    return BLACK_SIGMA * read_noise_dn(model) if number.effect == "black_level" else BASE_SIGMA
+    return BLACK_SIGMA * read_noise_dn(model) if number.place == LEVEL else BASE_SIGMA
 
 
 def _shifts(model: NoiseModel, turned: Parameters, y: np.ndarray, bench: Bench) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import special
 
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
@@ -13,11 +14,13 @@ def as_scattered(covariance: np.ndarray, gain: np.ndarray, prior: np.ndarray, z:
     The inverse information, `covariance`, is right for weights that are the statistics' own inverse covariance, which
     few draws do not give. gain [number, statistic] leads from statistics to the score. prior [number]: inverse
     variances that hold numbers near the start. z: draws about their mean [draw, statistic], other ones than the weights
-    are from. The noise of a mean of as many draws is included.
+    are from. The noise of a mean of as many draws is included, and errors that so few draws tell are widened until
+    1.96 of them hold 95 % (Student's t).
     """
     n = len(z)
     estimates = z @ (covariance @ gain).T
-    return estimates.T @ estimates * (1 + 1 / n) / (n - 1) + (covariance * prior) @ covariance
+    few = (special.stdtrit(n - 1, 0.975) / special.ndtri(0.975)) ** 2
+    return estimates.T @ estimates * few * (1 + 1 / n) / (n - 1) + (covariance * prior) @ covariance
 
 
 def not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -75,6 +75,12 @@ class Number:
         """Its value in a model."""
         return float(np.asarray(getattr(model[self.effect], self.field))[self.index])
 
+    def put_in(self, model: NoiseModel, value: float) -> NoiseModel:
+        """The model with another value of it."""
+        values = np.array(getattr(model[self.effect], self.field), float)
+        values[self.index] = value
+        return model.with_value(self.effect, self.field, values)
+
 
 def bounds_of(spec: ParameterSpec) -> tuple[float, float]:
     """Lower and upper bound, infinite where there is none."""
