@@ -165,11 +165,13 @@ def _true_of_case(base: dict) -> dict[str, float]:
     }
 
 
-def measure(cell: Cell, refit: bool) -> dict[str, Any]:
+def measure(cell: Cell, refit: bool, improve_minutes: float | None = None) -> dict[str, Any]:
     """The record of a cell; after an exception, the measurements so far and the error's text."""
     record: dict[str, Any] = {**cell.about, "refit": refit, "seconds": {}, "failure": None}
     try:
         _measure(cell, refit, record)
+        if improve_minutes is not None:
+            _improve(cell, improve_minutes, record)
     except Exception as problem:  # a failed cell must not stop the grid
         record["failure"] = f"{type(problem).__name__}: {problem}"
     return _plain(record)
@@ -197,6 +199,20 @@ def _measure(cell: Cell, refit: bool, record: dict[str, Any]) -> None:
     record["added"] = {n: [value, error] for n, (value, error, _) in again.table.items() if n.startswith(added)}
     with _timed(seconds, "compare again"):
         record["error_after"] = hsnoise.compare(again.params, stack, seed=seed).error
+
+
+def _improve(cell: Cell, minutes: float, record: dict[str, Any]) -> None:
+    """What the whole loop makes of the capture: what it added, how it ended, where that left the base parameters."""
+    stack, truth = cell.make()
+    with _timed(record["seconds"], "improve"):
+        story = hsnoise.improve(stack, max_minutes=minutes, seed=cell.about["seed"])
+    record["improved"] = {
+        "added": [step.added for step in story.steps if step.added],
+        "ended": story.ending.why,
+        "light": story.conclusion.light,
+        "error": story.errors[-1],
+        "base": {name: one for name, one in _estimates(story.fit, truth).items() if name not in story.fit.withheld},
+    }
 
 
 def _told(found: Diagnosis, hidden: list[str]) -> dict[str, Any]:

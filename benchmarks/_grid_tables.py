@@ -30,6 +30,7 @@ def sheets(records: Iterable[dict]) -> list[Sheet]:
         false_alarms([r for r in told if r["effect"] == CLEAN and r["kind"] != "case"]),
         outside([r for r in told if r["kind"] == "grid" and r["effect"] in ODD]),
         pairs([r for r in told if r["kind"] == "grid" and len(hidden_in(r["effect"])) > 1]),
+        improved([r for r in told if "improved" in r]),
         cases([r for r in told if r["kind"] == "case"]),
         improvement(told),
         durations(told),
@@ -148,6 +149,29 @@ def pairs(records: list[dict]) -> Sheet:
         counts = str(sum(map(first_right, group))), str(both), str(len(group))
         sheet.rows.append((*_text(key), _counted(r["verdict"] for r in group), *counts))
     return sheet
+
+
+def improved(records: list[dict]) -> Sheet:
+    """What `improve` made of each capture, and the base parameter that it left farthest from the truth."""
+    headings = ("hidden", "camera", "added", "ended", "light", "error before", "after", "farthest of the base")
+    sheet = Sheet("The whole loop", headings, left=5)
+    for record in sorted(records, key=lambda r: (r["effect"], r["key"])):
+        found = record["improved"]
+        errors = _number(record["error_before"]), _number(found["error"])
+        added = ", ".join(found["added"]) or "–"
+        sheet.rows.append(
+            (record["effect"], record["camera"], added, found["ended"], found["light"], *errors, bent(record))
+        )
+    return sheet
+
+
+def bent(record: dict) -> str:
+    """The gain, dark current or read noise that `improve` left farthest off, relative, and in standard errors."""
+    kept = ("gain", "dark_current", "read_noise")
+    truth, known = record["truth"], record["improved"]["base"].items()
+    off = [(v / truth[n] - 1, (v - truth[n]) / e, n) for n, (v, e) in known if e and n.split(".")[0] in kept]
+    share, errors, name = max(off, key=lambda one: abs(one[0]), default=(0.0, 0.0, "none fitted"))
+    return f"{name} {share:+.1%} ({errors:+.1f})" if off else name
 
 
 def cases(records: list[dict]) -> Sheet:

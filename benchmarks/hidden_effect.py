@@ -1,7 +1,7 @@
 """Is the hidden effect found? Fit, compare, diagnose and refit on a grid of simulated dark captures.
 
     python -m benchmarks.hidden_effect --amplitudes 1,0.5 --seeds 5 --refit
-    python -m benchmarks.hidden_effect --effects odd --pairs
+    python -m benchmarks.hidden_effect --effects odd --pairs --improve 3
     python -m benchmarks.hidden_effect --layouts --seeds 10
     python -m benchmarks.hidden_effect --cases FOLDER --refit
     python -m benchmarks.hidden_effect --report-only
@@ -41,10 +41,16 @@ def read(out: Path) -> dict[str, dict]:
     return records
 
 
-def run(cells: list[Cell], out: Path, refit: bool, minutes: float | None) -> None:
-    """Measure the cells that `out` lacks; cells without a refit are run again if a refit is wanted."""
+def run(cells: list[Cell], out: Path, refit: bool, improve_minutes: float | None, minutes: float | None) -> None:
+    """Measure the cells that `out` lacks; cells without a refit, or a run of `improve`, if that is wanted now."""
     records = read(out)
-    left = [c for c in cells if c.about["key"] not in records or (refit and not records[c.about["key"]]["refit"])]
+
+    def lacks(cell: Cell) -> bool:
+        record = records.get(cell.about["key"])
+        unimproved = improve_minutes is not None and record is not None and "improved" not in record
+        return record is None or (refit and not record["refit"]) or unimproved
+
+    left = [cell for cell in cells if lacks(cell)]
     out.parent.mkdir(parents=True, exist_ok=True)
     end = None if minutes is None else time.monotonic() + 60 * minutes
     with out.open("a") as file:
@@ -54,7 +60,7 @@ def run(cells: list[Cell], out: Path, refit: bool, minutes: float | None) -> Non
         for cell in track(left, description=description, console=Console(stderr=True)):
             if end is not None and time.monotonic() > end:
                 break
-            file.write(json.dumps(measure(cell, refit), allow_nan=False) + "\n")
+            file.write(json.dumps(measure(cell, refit, improve_minutes), allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
             forget_compiled_programs()
@@ -148,6 +154,7 @@ def main() -> None:
     add("--layouts", action="store_true", help="clean captures of other layouts instead of the grid")
     add("--cases", type=Path, nargs="?", const=folder_of_cases(), help="captures of a folder instead of the grid")
     add("--refit", action="store_true", help="fit again with the effect found, and compare again")
+    add("--improve", type=float, metavar="MINUTES", help="run the whole loop, too, each for so long")
     add("--minutes", type=float, help="start no new cell after this time")
     add("--out", type=Path, default=Path("build/hidden_effect.jsonl"), help="where finished cells are kept")
     add("--report-only", action="store_true", help="only tables of the records in --out, nothing is run")
@@ -155,7 +162,7 @@ def main() -> None:
     if arguments.seeds < 1 or arguments.frames < 1:
         parser.error("--seeds, --frames: expected at least 1")
     if not arguments.report_only:
-        run(cells_of(parser, arguments), arguments.out, arguments.refit, arguments.minutes)
+        run(cells_of(parser, arguments), arguments.out, arguments.refit, arguments.improve, arguments.minutes)
     report(arguments.out)
 
 

@@ -64,7 +64,21 @@ MODEST = {
     "black_clamp": 0.7,  # of the dark level
     "nonlinearity": 0.003,  # curvature, 1/e-
 }
-ODD = ("ramp_37_rows", "block_offsets", "read_noise_along_row", "gain_vignette")
+# Effects that the library does not have.
+ODD = (
+    "ramp_37_rows",
+    "block_offsets",
+    "read_noise_along_row",
+    "gain_vignette",
+    "gain_slope",
+    "dark_vignette",
+    "dark_swing",
+    "noise_over_frames",
+    "noisy_odd_columns",
+    "coupled_columns",
+    "rows_swapped",
+    "row_memory",
+)
 PAIRS = (
     ("row_noise", "hot_pixels"),
     ("column_fixed_pattern", "amplifier_glow"),
@@ -147,7 +161,7 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
     elif effect == "dark_signal_nonuniformity":
         out["offset"] = size * rng.standard_normal(shape)
     elif effect == "odd_even_pattern":
-        out["offset"] = size * ((c // (1 if len(camera.gain) == 1 else 2)) % 2 - 0.5)
+        out["offset"] = size * (_parity(camera, shape) - 0.5)
     elif effect == "tap_offsets":
         taps = int(rng.choice([2, 4, 8]))
         levels = rng.standard_normal(taps)
@@ -181,10 +195,25 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
     elif effect == "read_noise_along_row":
         spread = 1 + 0.6 * size * (c / columns - 0.5)
         out["read"] = spread / np.sqrt((spread**2).mean())
-    elif effect == "gain_vignette":
+    elif effect in ("gain_vignette", "dark_vignette"):
         far = ((r - rows / 2) / rows) ** 2 + ((c - columns / 2) / columns) ** 2
-        out["gain"] = 1 - 0.5 * size * (far - far.mean())
+        less = size * (far - far.mean())
+        out.update({"gain": 1 - 0.5 * less} if effect == "gain_vignette" else {"rate": -camera.dark * less})
+    elif effect == "gain_slope":
+        out["gain"] = 1 + 0.3 * size * (c / columns - 0.5)
+    elif effect == "noisy_odd_columns":
+        out["noisy"] = _parity(camera, shape)
+    elif effect == "coupled_columns":
+        out["column"] = int(rng.integers(4, columns - 4))
+    elif effect == "rows_swapped":
+        out["row"] = 2 * int(rng.integers(0, rows // 4))
     return out
+
+
+def _parity(camera: Camera, shape) -> np.ndarray:
+    """0 in even columns of each colour, 1 in odd ones."""
+    period = 1 if len(camera.gain) == 1 else 2
+    return np.broadcast_to(np.arange(shape[1]) // period % 2, shape)
 
 
 def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) -> np.ndarray:
@@ -192,7 +221,11 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     rate = camera.dark + hidden.get("rate", 0.0)
     if drift := sizes.get("dark_current_drift"):
         rate = rate * (1 + drift * np.arange(frames)[:, None, None] / max(frames - 1, 1))
+    if swing := sizes.get("dark_swing"):
+        rate = rate * (1 + 0.1 * swing * np.sin(1.7 * np.arange(frames) + rng.uniform(0, 2 * np.pi)))[:, None, None]
     x = rng.poisson(np.broadcast_to(rate * t, whole)).astype(float)
+    if excess := sizes.get("noisy_odd_columns"):
+        x += np.sqrt(0.3 * excess * x * hidden["noisy"]) * rng.standard_normal(whole)
     if hits := sizes.get("cosmic_rays"):
         x += (rng.random(whole) < hits * 1e-6) * rng.exponential(120.0, whole)
     if leak := sizes.get("crosstalk"):
@@ -206,7 +239,11 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
         noise = rng.standard_t(freedom, whole) * np.sqrt((freedom - 2) / freedom)
     if share := sizes.get("correlated_read_noise"):
         noise = np.sqrt(1 - share) * noise + np.sqrt(share) * _along_rows(hidden, rng, whole)
+    if growth := sizes.get("noise_over_frames"):
+        noise *= np.linspace(1 - 0.3 * growth, 1 + 0.3 * growth, frames)[:, None, None]
     x += camera.read * noise * hidden.get("read", 1.0) + hidden.get("offset", 0.0)
+    if coupling := sizes.get("coupled_columns"):
+        x[:, :, hidden["column"]] += coupling * x[:, :, hidden["column"] - 2]
     for effect, size in sizes.items():
         x += _moving(effect, size, hidden, rng, frames, shape)
     if smear := sizes.get("readout_bandwidth"):
@@ -216,7 +253,7 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     if curvature := sizes.get("nonlinearity"):
         x = np.minimum(x, 0.5 / curvature)  # constant beyond the maximum
         x = x - curvature * np.maximum(x, 0) ** 2
-    return _digital(camera, sizes, x * hidden.get("gain", 1.0), hidden.get("black", 0.0), t, rng)
+    return _digital(camera, sizes, x * hidden.get("gain", 1.0), hidden, t, rng)
 
 
 def _along_rows(hidden, rng, shape: tuple[int, ...]) -> np.ndarray:
@@ -242,14 +279,18 @@ def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float
         return size * np.sin(2 * np.pi * hidden["frequency"] * np.arange(rows)[None, :, None] + phase)
     if effect == "random_telegraph_noise":
         return 12.0 * hidden["jumping"] * (rng.random((frames, *shape)) < hidden["duty"])
+    if effect == "row_memory":
+        kicks = rng.standard_normal((frames, rows, 1))
+        kicks[1:] *= 0.6
+        return size * lfilter([1.0], [1.0, -0.8], kicks, axis=0)
     if effect == "ramp_37_rows":
         return (1.5 * size * ((np.arange(rows) % 37) / 37 - 0.5))[None, :, None]
     return 0.0
 
 
-def _digital(camera: Camera, sizes, x: np.ndarray, shading, t: float, rng) -> np.ndarray:
+def _digital(camera: Camera, sizes, x: np.ndarray, hidden, t: float, rng) -> np.ndarray:
     """Gain, row gain, black level and its shading, codes."""
-    frames, rows, _ = x.shape
+    frames, rows, columns = x.shape
     channels = len(camera.gain)
     colour = colour_of(x.shape[1:], channels)
     shared = np.zeros((frames, rows))
@@ -261,7 +302,11 @@ def _digital(camera: Camera, sizes, x: np.ndarray, shading, t: float, rng) -> np
         beta = np.maximum(beta, 0) * np.maximum(1 + shared, 0)
         clamped = sizes.get("black_clamp", 0.0) * camera.gain[c] * camera.dark * t
         y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x - clamped, y)
-    counts = np.clip(np.rint(y + camera.black + shading), 0, 65535)
+    counts = np.clip(np.rint(y + camera.black + hidden.get("black", 0.0)), 0, 65535)
+    if "row" in hidden:  # the readout has lost step for a fifth of the rows
+        swapped = slice(hidden["row"], hidden["row"] + 2 * (rows // 10))
+        pairs = counts[:, swapped].reshape(frames, -1, 2, columns)
+        counts[:, swapped] = pairs[:, :, ::-1].reshape(frames, -1, columns)
     if more := sizes.get("missing_codes"):
         counts = np.clip(np.rint(np.rint(counts / (1 + more)) * (1 + more)), 0, 65535)
     return counts.astype(np.uint16)

@@ -101,6 +101,13 @@ def record(effect, verdict, names=(), top=(), seed=0, amplitude=1.0, **more):
 @pytest.fixture
 def records():
     refit = {"refit": True, "error_after": 1.0, "base_after": {"gain.R": [1.1, 0.1]}}
+    improved = {
+        "added": ["row_noise"],
+        "ended": "unexplained",
+        "light": "red",
+        "error": 9.0,
+        "base": {"gain.R": [0.9, 0.05]},
+    }
     right, wrong = ("row_noise", 50.0), ("column_noise", 60.0)
     failed = _grid_cells.grid_cells(["canon"], ["crosstalk"], [1.0], [0], 8, (32, 48))[0]
     return [
@@ -109,7 +116,7 @@ def records():
         record("row_noise", "ambiguous", ["row_noise", "column_noise"], [right, wrong], seed=2),
         record("none", "nothing missing", top=[right]),
         record("none", "unexplained", top=[right], seed=1),
-        record("ramp_37_rows", "unexplained", top=[right]),
+        record("ramp_37_rows", "unexplained", top=[right], improved=improved),
         record("row_noise+hot_pixels", "named", ["hot_pixels"], [("hot_pixels", 90.0), right]),
         {**failed.about, "refit": False, "seconds": {"simulate": 0.1, "fit": 1.0}, "failure": "ValueError: no"},
     ]
@@ -121,8 +128,10 @@ def test_tables_count_what_was_found(records):
     assert tables["Confusion: another effect first"] == [("row_noise", "column_noise", "named", "1", "1")]
     assert tables["False alarms on clean captures"][0][2:7] == ("2", "1", "0", "50.0%", "97.5%")
     assert tables["Two effects at once"][0][3:] == ("named 1", "1", "1", "1")
-    improved = {row[0]: row[1:] for row in tables["Error (median) and base parameters"]}
-    assert improved["row_noise"] == ("3", "1", "20", "1", "0% of 1", "100% of 1")
+    whole = ("ramp_37_rows", "canon", "row_noise", "unexplained", "red", "20", "9", "gain.R -10.0% (-2.0)")
+    assert tables["The whole loop"] == [whole]
+    again = {row[0]: row[1:] for row in tables["Error (median) and base parameters"]}
+    assert again["row_noise"] == ("3", "1", "20", "1", "0% of 1", "100% of 1")
     assert tables["Cells that raised"][0][1:] == ("fit", "ValueError: no")
 
 
@@ -134,13 +143,13 @@ def test_upper_bound_of_no_alarm_is_the_rule_of_three():
 
 def test_report_writes_markdown_and_figure(records, tmp_path, monkeypatch, capsys):
     cells = iter(records)
-    monkeypatch.setattr(hidden_effect, "measure", lambda cell, refit: next(cells))
+    monkeypatch.setattr(hidden_effect, "measure", lambda cell, refit, minutes: next(cells))
     jobs = [_grid_cells.Cell({"key": one["key"]}, None) for one in records]
     out = tmp_path / "grid.jsonl"
     out.write_text('{"key": "cut o')
-    hidden_effect.run(jobs, out, refit=False, minutes=None)
+    hidden_effect.run(jobs, out, refit=False, improve_minutes=None, minutes=None)
     assert len(hidden_effect.read(out)) == len(records)
-    hidden_effect.run(jobs, out, refit=False, minutes=None)  # everything is there already
+    hidden_effect.run(jobs, out, refit=False, improve_minutes=None, minutes=None)  # everything is there already
     hidden_effect.report(out)
     assert "| canon | 1 | 3 |" in out.with_suffix(".md").read_text()
     assert out.with_suffix(".png").stat().st_size > 1000
