@@ -27,10 +27,18 @@ def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -
     """Notes on the gain from flats."""
     notes = list(flats.set_aside)
     for c, channel in enumerate(channels):
-        of = "" if channel == "mono" else f" of channel {channel}"
-        for note in (_undetermined, _left_out, _bent, _scattered):
-            notes += note(found, c, of)
-    return notes + _falling_black(found, flats)
+        for note in (_undetermined, _left_out, _bent):
+            notes += note(found, c, _of(channel))
+    return notes + scattered(found, channels) + _falling_black(found, flats)
+
+
+def scattered(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
+    """Sentences on flats that no smooth curve describes."""
+    return [note for c, channel in enumerate(channels) for note in _scattered(found, c, _of(channel))]
+
+
+def _of(channel: str) -> str:
+    return "" if channel == "mono" else f" of channel {channel}"
 
 
 def _undetermined(found: FlatGain, c: int, of: str) -> list[str]:

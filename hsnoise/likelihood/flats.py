@@ -125,21 +125,35 @@ def _of_place(stack: FrameStack, darks: list[tuple[float, Measured]], tick) -> t
     black = {i: _black(stack, dark[i]) for i in flats}
     series = [[Shot(i, n) for n in range(stack.n_frames[i])] for i in flats if stack.n_frames[i] > 1]
     pairs, lone = pairs_of_singles(stack, [Shot(i, 0) for i in flats if stack.n_frames[i] == 1], black)
-    aside = [f"{_named(stack, one.group)} is set aside: a single frame, and no other in similar light." for one in lone]
-    found = []
+    unlit, clipped, found = [], {}, []
     for shots in series + pairs:
         group = shots[0].group
         level = _measure(stack, shots, black, dark[group], tick)
         if (level.kept >= FEWEST_PIXELS).all():
             found.append(_fields(stack, shots, level, dark[group]))
+        elif (level.kept == 0).any():
+            unlit.append(group)
         else:
-            lost = "it holds no light" if (level.kept == 0).any() else f"{1 - level.kept.min():.0%} of its pixels clip"
-            aside.append(f"{_named(stack, group)} is set aside: {lost}.")
-    return found, aside
+            clipped[group] = 1 - level.kept.min()
+    return found, _set_aside(stack, [one.group for one in lone], unlit, clipped)
 
 
-def _named(stack: FrameStack, group: int) -> str:
-    return f"Flat level {group} ({stack.exposure_s[group]:g} s)"
+def _set_aside(stack: FrameStack, lone: list[int], unlit: list[int], clipped: dict[int, float]) -> list[str]:
+    """Sentences on the levels that cannot be used; clipped: the share of their pixels that clip."""
+    low, high = (f"{of(clipped.values(), default=0.0):.0%}" for of in (min, max))
+    reasons = (
+        (lone, "a single frame, and no other in similar light"),
+        (unlit, "no light"),
+        (list(clipped), f"{low if low == high else f'{low} to {high}'} of the pixels clip"),
+    )
+    return [f"{_named(stack, groups)} set aside: {why}." for groups, why in reasons if groups]
+
+
+def _named(stack: FrameStack, groups: list[int]) -> str:
+    times = [f"{stack.exposure_s[group]:g}" for group in groups]
+    if len(groups) == 1:
+        return f"Flat level {groups[0]} ({times[0]} s) is"
+    return f"Flat levels {', '.join(map(str, groups[:-1]))} and {groups[-1]} ({', '.join(times)} s) are"
 
 
 def _fields(stack: FrameStack, shots: list[Shot], level: Measured, dark: Measured) -> dict:

@@ -16,10 +16,11 @@ from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._stated import header_gain, stated
-from hsnoise.fitting.flat_notes import gain_notes
+from hsnoise.fitting.flat_notes import gain_notes, scattered
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method
+from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
 from hsnoise.statistics.pixels.along_rows import of_the_signal
 from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
@@ -64,6 +65,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_outliers(result),
         *_moved_pedestals(result),
         *_many_hot(result),
+        *_scattered_flats(result),
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
@@ -262,6 +264,14 @@ def _outliers(result: FitResult) -> Iterator[str]:
 def _of_flats(result: FitResult) -> list[str]:
     flats = result.transfer.flats
     return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
+
+
+def _scattered_flats(result: FitResult) -> list[str]:
+    flats = result.summary.flats
+    if flats is None:
+        return []
+    found = flat_gain_of(result.params, flats) if result.transfer is None else result.transfer.flats
+    return [] if found is None else scattered(found, result.summary.channels)
 
 
 def _of_neighbours(result: FitResult) -> Iterator[str]:
