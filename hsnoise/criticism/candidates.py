@@ -21,6 +21,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
+from hsnoise.statistics.pixels.row_groups import row_groups_in
 from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
@@ -55,6 +56,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
         line=moving_line(part, drawn, black_level_of(model)),
         places=places(part),
         code_step=code_step(part),
+        row_groups=row_groups_in(part),
     )
 
 

@@ -49,6 +49,7 @@ from hsnoise.effects.readout_overshoot import ReadoutOvershoot
 from hsnoise.effects.row_bank_noise import RowBankNoise
 from hsnoise.effects.row_fixed_pattern import RowFixedPattern
 from hsnoise.effects.row_gain import RowGain
+from hsnoise.effects.row_group_noise import RowGroupNoise
 from hsnoise.effects.row_noise import RowNoise
 from hsnoise.effects.shared_row_gain import SharedRowGain
 from hsnoise.effects.shot_noise import ShotNoise
@@ -65,6 +66,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     SharedRowGain,
     RowNoise,
     RowBankNoise,
+    RowGroupNoise,
     ColumnNoise,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -152,6 +154,7 @@ __all__ = [
     "RowBankNoise",
     "RowFixedPattern",
     "RowGain",
+    "RowGroupNoise",
     "RowNoise",
     "SharedRowGain",
     "ShotNoise",

@@ -51,6 +51,7 @@ class CaptureFacts:
         line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
         places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
+        row_groups: rows, start, row_banks and column_banks of a `RowGroupNoise`; None if no rows are read together.
     """
 
     effects: tuple[str, ...]
@@ -69,6 +70,7 @@ class CaptureFacts:
     line: tuple[str, float]
     places: Places
     code_step: float | None
+    row_groups: tuple[int, int, int, int] | None
 
     @property
     def dark_e(self) -> float:

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
+from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
@@ -28,19 +29,13 @@ from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
 from hsnoise.statistics.pixels.read_noise import read_noise_spread
+from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
-from hsnoise.statistics.pixels.shading import Shading, shading_of
+from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
-PATTERNS = {
-    "frame": "frame_offset",
-    "row": "row_fixed_pattern",
-    "column": "column_fixed_pattern",
-    "row_x_frame": "row_noise",
-    "column_x_frame": "column_noise",
-}
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
@@ -98,12 +93,14 @@ class PixelFit:
     """The channels, the gain of the flats if there are any, and the joint estimate with its covariance.
 
     ringing: the part of the read noise that goes on along rows, if it is there.
+    row_groups: rows that are read together, if there are.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
     channels: tuple[Channel, ...]
     flats: FlatGain | None
     ringing: Ringing | None
+    row_groups: RowGroups | None
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -123,8 +120,8 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     unlit = summary.flats is None and not summary.exposure_s.any()
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
-        channels = [_without_rows_of(ringing, one, _shortest(found, c)) for c, one in enumerate(channels)]
-    return PixelFit(tuple(channels), flats, ringing, estimate, covariance, bool(known.all()))
+        channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
+    return PixelFit(tuple(channels), flats, ringing, found.row_groups, estimate, covariance, bool(known.all()))
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:
@@ -148,8 +145,11 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             # If ordinary pixels do not grow, hot ones only give a bound.
             values[:2] = 1.0, floor
             covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
-    rows, shading = _row_gain(found, c, values[2]), _shadings(found, c)
-    patterns = _patterns(found, c, shading)
+    if found.row_groups is not None:
+        apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
+        values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
+    rows, shading = _row_gain(found, c, values[2]), shadings_of(found, c)
+    patterns = patterns_of(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
@@ -167,13 +167,13 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         patterns=patterns,
         temporal_dn2=floor,
         shading=shading,
-        row_spectrum=row_spectrum(_shortest(found, c), found.shape[0], _wave_of(found, c, "row")),
+        row_spectrum=row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c)),
         noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
-        banding=_banding(found, c),
+        banding=banding_in(found, c),
         subtracted=subtracted(transfer, (growth, growth_error)),
     )
 
@@ -189,18 +189,6 @@ def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, raised: f
     values[1] += more
     covariance[1, 1] += (more / 2) ** 2
     covariance[0, 0] += (UNSEEN * (raised - 1) * values[0]) ** 2
-
-
-def _banding(found: Survey, c: int) -> tuple[str, Banding] | None:
-    """The strongest sinusoid over rows or columns, and its axis: a model has one."""
-    several = [pair for plane in _shortest(found, c) for pair in plane.banding.items()]
-    return max(several, key=lambda pair: pair[1].variance_dn2, default=None)
-
-
-def _wave_of(found: Survey, c: int, axis: str) -> Banding | None:
-    """The sinusoid that the model has, if it is over this axis."""
-    wave = _banding(found, c)
-    return None if wave is None or wave[0] != axis else wave[1]
 
 
 def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> tuple[float, float]:
@@ -224,7 +212,7 @@ def _without_rows_of(ringing: Ringing, channel: Channel, planes: list[Plane]) ->
 def _warm(found: Survey, c: int) -> Warm | None:
     if found.shortest is None:
         return None
-    return warm_of(found.shortest.pixels(c, "level_dn"), len(_shortest(found, c)[0].column_mean_dn))
+    return warm_of(found.shortest.pixels(c, "level_dn"), len(shortest_of(found, c)[0].column_mean_dn))
 
 
 def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
@@ -274,7 +262,7 @@ def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
     """Pixel differences at the shortest exposure [half, block], and the pixels' low-side standard deviation, DN."""
-    planes, rows = _shortest(found, c), len(found.sampled_rows) * plane_rows(found)
+    planes, rows = shortest_of(found, c), len(found.sampled_rows) * plane_rows(found)
     low_side = float(np.mean([low_side_sigma(plane.halves.level_dn, rows) for plane in planes]))
     return _blocks(found, planes), low_side
 
@@ -285,46 +273,9 @@ def _blocks(found: Survey, planes: list[Plane]) -> np.ndarray:
     return np.concatenate([double_differences(plane.halves.level_dn, rows) for plane in planes], axis=1)
 
 
-def _shortest(found: Survey, c: int) -> list[Plane]:
-    """The planes of a channel at the shortest dark exposure of several frames; empty without one."""
-    return [] if found.shortest is None else found.shortest.of(c)
-
-
-def _shadings(found: Survey, c: int) -> dict[str, Shading]:
-    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one."""
-    planes, out = _shortest(found, c), {}
-    for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
-        if planes:
-            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
-            one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
-            out |= {} if one is None else {axis: one}
-    largest = max(out, key=lambda axis: out[axis].amplitude_dn, default=None)
-    return {} if largest is None else {largest: out[largest]}
-
-
-def _patterns(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
-    """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
-    planes, out = _shortest(found, c), {}
-    if not planes:
-        return out
-    waves = {axis: _wave_of(found, c, axis) for axis in ("row", "column")}
-    of_wave = {f"{axis}_x_frame": one.variance_dn2 for axis, one in waves.items() if one is not None}
-    for component, effect in PATTERNS.items():
-        shared = mean_of([plane.components[component] for plane in planes])
-        smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
-        # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
-        of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
-        out[effect] = (
-            shared.variance_dn2 - smooth - of_wave.get(component, 0.0),
-            shared.standard_error_dn2,
-            float(np.hypot(shared.chance_dn2, of_mean)),
-        )
-    return out
-
-
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
     """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
-    return next((p.narrow_dn for p in _shortest(found, c)), None)
+    return next((p.narrow_dn for p in shortest_of(found, c)), None)
 
 
 def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:

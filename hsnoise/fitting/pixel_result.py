@@ -27,10 +27,12 @@ from hsnoise.effects import (
     ReadNoiseNonuniformity,
     RowBankNoise,
     RowFixedPattern,
+    RowGroupNoise,
     RowNoise,
 )
-from hsnoise.fitting.pixel_fit import PATTERNS, Channel, PixelFit, weighted_mean
+from hsnoise.fitting.pixel_fit import Channel, PixelFit, weighted_mean
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
+from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -57,6 +59,7 @@ OF_PIXELS = (
     ColumnFixedPattern,
     RowNoise,
     RowBankNoise,
+    RowGroupNoise,
     ColumnNoise,
     BlackShading,
     CorrelatedReadNoise,
@@ -159,6 +162,10 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
         amplitude, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
         size = amplitude / g, wave[1].error_dn2 / amplitude / g
         found["periodic_banding"] = {"amplitude": size, "frequency": (wave[1].frequency, np.inf)}
+    if (groups := pixel.row_groups) is not None:
+        sigma = float(np.sqrt(groups.variance_dn2[0]))
+        size = sigma / gain.mean(), groups.variance_dn2[1] / (2 * sigma * gain.mean())
+        found["row_group_noise"] = {"sigma": size, "shared": groups.shared}
     exponents = [c.row_spectrum.exponent for c in pixel.channels]
     if "row_noise" in found:
         sigma, error = found["row_noise"]["sigma"]
@@ -330,6 +337,8 @@ def _settings(name: str, pixel: PixelFit) -> dict[str, Any]:
         return {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
     if name == "periodic_banding" and (wave := pixel.channels[0].banding) is not None:
         return {"axis": wave[0]}
+    if name == "row_group_noise" and (groups := pixel.row_groups) is not None:
+        return dict(zip(("rows", "start", "row_banks", "column_banks"), groups.layout, strict=True))
     jumps = pixel.channels[0].jumps
     if name == "random_telegraph_noise" and jumps is not None:
         return {"double_sampling": jumps.double_sampling}

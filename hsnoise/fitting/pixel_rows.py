@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of, fading_power, power_of_banks
 from hsnoise.statistics.decomposition import Component, mean_of
-from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.survey import Plane
 
 TOGETHER = 6.0  # chance deviations above which rows are not white
@@ -37,21 +36,25 @@ class RowSpectrum(NamedTuple):
 WHITE = RowSpectrum((0.0, np.inf), None, 1.0)
 
 
-def row_spectrum(planes: Sequence[Plane], rows: int, wave: Banding | None = None) -> RowSpectrum:
+def row_spectrum(
+    planes: Sequence[Plane], rows: int, known_dn2: Callable[[int], float] = lambda apart: 0.0
+) -> RowSpectrum:
     """The spectrum from the covariance of rows of one colour's planes; rows: of the frame.
 
-    wave: a sinusoid over the rows of a mono sensor, which has an effect of its own.
+    known_dn2: the part of the covariance of rows so far apart that is of other effects.
     """
     if not planes:
         return WHITE
     alone = mean_of([p.components["row_x_frame"] for p in planes])
     near, but_one = (mean_of([p.rows_together[lag] for p in planes]) for lag in (0, 1))
-    if wave is not None:
-        alone, near, but_one = (_without(wave, one, lag) for lag, one in enumerate((alone, near, but_one)))
+    step = rows // len(planes[0].row_mean_dn)
+    alone, near, but_one = (
+        replace(one, variance_dn2=one.variance_dn2 - known_dn2(lag * step))
+        for lag, one in enumerate((alone, near, but_one))
+    )
     if alone.variance_dn2 <= 0:
         return WHITE
     combed = (but_one.variance_dn2 - near.variance_dn2) / np.hypot(but_one.chance_dn2, near.chance_dn2)
-    step = rows // len(planes[0].row_mean_dn)
     banks = None
     if step == 1 and combed > COMBED and near.variance_dn2 > -TOGETHER * near.chance_dn2:
         of = np.array([near.variance_dn2, but_one.variance_dn2]) / alone.variance_dn2
@@ -60,13 +63,6 @@ def row_spectrum(planes: Sequence[Plane], rows: int, wave: Banding | None = None
     exponent = _exponent(near, alone, rows, step)
     power = fading_power(rows, np.float32(exponent[0])) if banks is None else _power_of(banks, rows)
     return RowSpectrum(exponent, banks, _widened(np.array(power, float)))
-
-
-def _without(wave: Banding, of: Component, lag: int) -> Component:
-    """The covariance of rows `lag` apart without that of a sinusoid."""
-    return replace(
-        of, variance_dn2=of.variance_dn2 - wave.variance_dn2 * float(np.cos(2 * np.pi * wave.frequency * lag))
-    )
 
 
 def _exponent(near: Component, alone: Component, rows: int, step: int) -> Number:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import scipy  # its parts are imported when they are used
@@ -12,6 +13,7 @@ from hsnoise.statistics._exposures import Exposures, inner
 from hsnoise.statistics._sheet import ABS_VARIANCE, Sheet, correlation, correlations, fisher, log_ratio
 
 BANDS = 5
+BLOCKS_OF_ROWS, FEWEST_BLOCKS = (2, 4, 8, 16), 4  # rows that sensors read at a time
 HAAR_LEVELS = 6
 SAME_ROW = ((0, 1), (2, 3))
 SAME_COLUMN = ((0, 2), (1, 3))
@@ -85,6 +87,22 @@ def colours(sheet: Sheet, x: Exposures) -> None:
         sheet.add("row x frame", "correlation with the next frame", later, 1 / np.sqrt(n_rows * planes))
         later = _next(x.column_frame, 2)
         sheet.add("column x frame", "correlation with the next frame", later, 1 / np.sqrt(n_columns * planes))
+
+
+def together(sheet: Sheet, x: Exposures) -> None:
+    """Whether a row resembles its neighbours more inside blocks of some rows than across their edges."""
+    if x.shape[1] == 1:
+        return
+    score = np.zeros(len(x.row_frame))
+    for lag, size in product((1, 2), BLOCKS_OF_ROWS):
+        alike = (x.row_frame[..., lag:] * x.row_frame[..., :-lag]).mean((1, 2))
+        blocks = alike.shape[1] // size
+        if blocks < FEWEST_BLOCKS or size < 2 * lag:
+            continue
+        at_place = alike[:, : blocks * size].reshape(-1, blocks, size)
+        off = alike.mean(1, keepdims=True) - at_place.mean(1)
+        score = np.maximum(score, (off / (at_place.std(1) + TINY)).max(1) * np.sqrt(blocks))
+    sheet.add("row x frame", "rows read together", score, 0.6)
 
 
 def _next(moving: np.ndarray, axis: int, lag: int = 1) -> np.ndarray:

@@ -46,6 +46,7 @@ STATISTICS = (
     _pixels.codes,
     _lines.variances,
     _lines.colours,
+    _lines.together,
     _lines.scales,
     _lines.noise_of_rows,
     _lines.spectra,
@@ -65,6 +66,8 @@ WORDS = {
     " / ": "a / b: logarithm of the ratio of their mean squares, 0 if independent pixel noise makes both",
     "residual": "residual: a pixel of a frame minus its row, column and mean over frames, in spreads of its row",
     "correlation, same ": "correlation, same row (column): of two colours that share a row (column) of the sensor",
+    "read together": "read together: how much more a row resembles the next inside blocks of 2 to 16 rows than across"
+    " their edges",
     "coherence": "coherence: how much of a frequency band the colours have in common",
     "strongest frequency": "strongest frequency: how much of the static rows (columns) is a single sine",
     "steps of ": "steps of n: how much the mean changes from n rows (columns) to the next n",

@@ -18,6 +18,7 @@ from hsnoise.effects import (
     PeriodicBanding,
     RowBankNoise,
     RowFixedPattern,
+    RowGroupNoise,
     RowNoise,
     TapOffsets,
 )
@@ -93,6 +94,40 @@ def test_banks_take_turns(rows):
     np.testing.assert_allclose(common, rho, atol=0.03)
     # A bank is a series of half the length: its neighbours are nearly as alike as those of all rows.
     assert 0.4 < own[1] < rho[0] and both[1] > both[0] + 0.1 and both[3] > both[2] + 0.05
+
+
+@pytest.mark.parametrize(("row_banks", "column_banks"), [(1, 1), (2, 1), (1, 2), (2, 2)])
+def test_rows_of_a_group_share_their_offset(row_banks, column_banks):
+    """A group of six rows from row 4 on: a bank has one offset in it, other banks a share, the next group nothing."""
+    frames, shared = 4000, 0.4
+    effect = RowGroupNoise(2.0, shared, 6, 4, row_banks, column_banks)
+    drawn = darks(effect, frames, (16, 4), cfa="mono")
+    first, last = drawn[:, 4:6], drawn[:, 8:10]
+    np.testing.assert_array_equal(first, last)
+    np.testing.assert_array_equal(drawn[..., :2], drawn[..., 2:])
+    error = 5 * 4 * np.sqrt(2 / frames)
+
+    def product(row, column):
+        return np.mean(drawn[:, 4, 0] * drawn[:, row, column])
+
+    assert abs(product(4, 0) - 4) < error
+    for row, column, banks in ((5, 0, row_banks), (4, 1, column_banks), (5, 1, row_banks * column_banks)):
+        assert abs(product(row, column) - (4 if banks == 1 else 4 * shared)) < error
+    assert abs(product(10, 0)) < error and abs(product(3, 1)) < error
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rows": 1}, "rows: expected a whole number at least 2, got 1"),
+        ({"rows": 4, "start": 4}, "start: expected a whole number from 0 to 3, got 4"),
+        ({"column_banks": 3}, "column_banks: expected a whole number from 1 to 2, got 3"),
+        ({"row_banks": 1.5}, "row_banks: expected a whole number from 1 to 2, got 1.5"),
+    ],
+)
+def test_groups_that_no_sensor_has_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=f"row_group_noise.{message}"):
+        RowGroupNoise(1.0, **wrong)
 
 
 @pytest.mark.parametrize(("columns", "taps"), [(64, 4), (64, 2), (50, 3)])

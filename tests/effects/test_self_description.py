@@ -57,6 +57,7 @@ RICH = CaptureFacts(
     line=("row", 0.13),
     places=Places(("column", "last", True, 0.3), (1.0, 0.5), -1, 1),
     code_step=None,
+    row_groups=(8, 4, 2, 2),
 )
 POOR = dataclasses.replace(
     RICH,
@@ -79,6 +80,8 @@ DECLARED = [
     fx.RowNoise(2.0, 0.5),
     fx.RowBankNoise(2.0, 0.5, 0.4),
     fx.RowBankNoise(2.0, 1.2, after_gain=True),
+    fx.RowGroupNoise(2.0, 0.4, 4, 2, 2, 2),
+    fx.RowGroupNoise(2.0, rows=6, after_gain=True),
     fx.ColumnNoise(2.0, 1.0),
     fx.RowFixedPattern(2.0, after_gain=True),
     fx.ColumnFixedPattern(2.0),

@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hsnoise.effects import AmplifierGlow, BlackShading, FrameTilt, Gain, MeasuredMap, OddEvenPattern, TapOffsets
+from hsnoise.effects import (
+    AmplifierGlow,
+    BlackShading,
+    FrameTilt,
+    Gain,
+    MeasuredMap,
+    OddEvenPattern,
+    RowGroupNoise,
+    TapOffsets,
+)
 from hsnoise.model import NoiseModel, sample
 
 SENSOR = (48, 96)
@@ -18,6 +27,7 @@ PLACED = [
     OddEvenPattern(2.0),
     FrameTilt(8.0),
     FrameTilt(8.0, "column"),
+    RowGroupNoise(3.0, 0.2, 6, 5, 2, 2),
     MeasuredMap(np.arange(48.0)[:, None] + 100 * np.arange(96.0)),
 ]
 
@@ -27,7 +37,7 @@ def model_of(*effects, cfa="mono"):
 
 
 @pytest.mark.parametrize(
-    "effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns", "map"]
+    "effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns", "groups", "map"]
 )
 @pytest.mark.parametrize(("first", "shape"), [((0, 0), (48, 96)), ((20, 31), (8, 40)), ((47, 0), (1, 96))])
 def test_a_piece_is_cut_out_of_the_sensor(effect, first, shape):

@@ -21,6 +21,10 @@ class Banding(NamedTuple):
     variance_dn2: float
     error_dn2: float
 
+    def of_rows_dn2(self, apart: int = 0) -> float:
+        """Covariance of the means of rows (or columns) so far `apart`, DN^2."""
+        return self.variance_dn2 * float(np.cos(2 * np.pi * self.frequency * apart))
+
 
 def banding_of(means_dn: np.ndarray) -> Banding | None:
     """The sinusoid in means of rows or columns [frame, line]; None if no line stands out and holds much of them."""

@@ -15,6 +15,7 @@ from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouri
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
+from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -66,6 +67,7 @@ class Group:
     """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes.
 
     along: what pixels share of their temporal noise along rows; None if the frames do not show it.
+    row_groups: rows that are read together, in darks; None if the frames do not show any.
     files: names of the frames' files; empty for arrays.
     """
 
@@ -77,6 +79,7 @@ class Group:
     odd_lines: OddLines
     planes: tuple[Plane, ...]
     along: Along | None
+    row_groups: RowGroups | None
     files: tuple[str, ...]
 
     def of(self, channel: int) -> list[Plane]:
@@ -130,6 +133,11 @@ class Survey:
         return [group.along for group in self.groups if group.along is not None]
 
     @property
+    def row_groups(self) -> RowGroups | None:
+        """Rows that are read together, of the shortest darks."""
+        return None if self.shortest is None else self.shortest.row_groups
+
+    @property
     def has_exposures(self) -> bool:
         """Whether `repeated_darks` are of several exposures."""
         return len({group.exposure_s for group in self.repeated_darks}) > 1
@@ -170,12 +178,14 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
     sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
     kept: np.ndarray | None = None
     odd: OddLines | None = None
+    means: list[np.ndarray] = []
     clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
     for f, frame in enumerate(stack.frames(i)):
         if kept is None:
             kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
             odd = OddLines.of(frame, step)
         kept[f] = frame[rows]
+        means += [row_means(frame)] if stack.kind[i] == "dark" else []
         white = np.inf if stack.white_level is None else stack.white_level
         for p in range(step * step):
             plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
@@ -190,7 +200,9 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
         _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step) for p in range(step**2)
     )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
-    of_frames = along_rows(kept, step), tuple(Path(name).name for name in getattr(stack.counts[i], "names", ()))
+    first_row = 0 if stack.window is None else stack.window[0]
+    groups = row_groups_of(np.stack(means), first_row, planes[0].banding.get("row")) if means else None
+    of_frames = along_rows(kept, step), groups, tuple(Path(name).name for name in getattr(stack.counts[i], "names", ()))
     return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest
 
 

@@ -1,0 +1,82 @@
+"""What whole frames, rows and columns share in the shortest darks, and which part of it other effects make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.pixels.banding import Banding
+from hsnoise.statistics.pixels.shading import Shading, shading_of
+from hsnoise.statistics.pixels.survey import Plane, Survey
+
+PATTERNS = {
+    "frame": "frame_offset",
+    "row": "row_fixed_pattern",
+    "column": "column_fixed_pattern",
+    "row_x_frame": "row_noise",
+    "column_x_frame": "column_noise",
+}
+
+
+def shortest_of(found: Survey, c: int) -> list[Plane]:
+    """The planes of a channel at the shortest dark exposure of several frames; empty without one."""
+    return [] if found.shortest is None else found.shortest.of(c)
+
+
+def banding_in(found: Survey, c: int) -> tuple[str, Banding] | None:
+    """The strongest sinusoid over rows or columns, and its axis: a model has one."""
+    several = [pair for plane in shortest_of(found, c) for pair in plane.banding.items()]
+    return max(several, key=lambda pair: pair[1].variance_dn2, default=None)
+
+
+def _wave_of(found: Survey, c: int, axis: str) -> Banding | None:
+    """The sinusoid that the model has, if it is over this axis."""
+    wave = banding_in(found, c)
+    return None if wave is None or wave[0] != axis else wave[1]
+
+
+def known_of_rows(found: Survey, c: int, apart: int = 0) -> float:
+    """Covariance of rows so far apart that a sinusoid and groups of rows make at the shortest exposure, DN^2."""
+    wave, groups = _wave_of(found, c, "row"), found.row_groups
+    of_wave = 0.0 if wave is None else wave.of_rows_dn2(apart)
+    return of_wave + (0.0 if groups is None else groups.of_rows_dn2(apart, mono=found.cfa == "mono"))
+
+
+def shadings_of(found: Survey, c: int) -> dict[str, Shading]:
+    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one."""
+    planes, out = shortest_of(found, c), {}
+    for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
+        if planes:
+            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
+            one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
+            out |= {} if one is None else {axis: one}
+    largest = max(out, key=lambda axis: out[axis].amplitude_dn, default=None)
+    return {} if largest is None else {largest: out[largest]}
+
+
+def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
+    """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    planes, out = shortest_of(found, c), {}
+    if not planes:
+        return out
+    waves = {axis: _wave_of(found, c, axis) for axis in ("row", "column")}
+    known = {"row_x_frame": known_of_rows(found, c)}
+    known |= {} if waves["column"] is None else {"column_x_frame": waves["column"].variance_dn2}
+    scatter = {}
+    if (groups := found.row_groups) is not None:
+        of_mean_dn2 = groups.of_rows_dn2(mono=found.cfa == "mono") / found.shortest.n_frames
+        scatter = {"row_x_frame": groups.variance_dn2[1]}
+        scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
+    for component, effect in PATTERNS.items():
+        shared = mean_of([plane.components[component] for plane in planes])
+        smooth = shading[component].amplitude_dn ** 2 if component in shading else 0.0
+        # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
+        of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
+        out[effect] = (
+            shared.variance_dn2 - smooth - known.get(component, 0.0),
+            float(np.hypot(shared.standard_error_dn2, scatter.get(component, 0.0))),
+            float(np.hypot(shared.chance_dn2, max(of_mean, scatter.get(component, 0.0)))),
+        )
+    return out
