@@ -73,8 +73,10 @@ class RowGroupNoise(AbstractEffect):
         if facts.row_groups is None:
             return None
         # A quarter of the read noise, in the groups that the capture shows.
-        read, (rows, start, *banks) = facts.read_noise_e, facts.row_groups
-        return lambda size, rng: cls(0.25 * size * read, rng.uniform(0, 0.6), rows, start, *banks, either_side(rng))
+        settings = dict(zip(("rows", "start", "row_banks", "column_banks"), facts.row_groups, strict=True))
+        return lambda size, rng: cls(
+            0.25 * size * facts.read_noise_e, rng.uniform(0, 0.6), **settings, after_gain=either_side(rng)
+        )
 
     def components(self, capture: Capture) -> dict[str, float]:
         variance, shared = capture.offset_variance(self.sigma**2, self.after_gain), float(self.shared)
