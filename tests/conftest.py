@@ -25,6 +25,22 @@ gc.set_threshold(50_000)
 hypothesis.settings.register_profile("hsnoise", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("hsnoise")
 
+# Twenty seconds and more each: one that began last would leave the other core idle.
+LONG = (
+    "test_docs.py",
+    "test_contaminated.py",
+    "test_contract.py",
+    "test_loop.py",
+    "test_row_spectrum.py",
+    "test_cli.py",
+    "test_doubts.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, where a worker runs whole files in this order (`make test`)."""
+    items.sort(key=lambda item: item.path.name not in LONG)
+
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_programs():
