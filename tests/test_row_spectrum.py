@@ -193,7 +193,7 @@ def test_a_free_share_is_fitted_together_with_an_added_effect():
 @pytest.mark.parametrize("white_share", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_the_likelihood_tells_white_rows_from_flat_ones_of_mean_one(white_share):
     """White rows move the mean of a frame: it would be called frame_offset."""
-    result = hsnoise.fit(capture(camera(0.0, white_share), frames=6))
+    result = hsnoise.fit(capture(camera(0.0, white_share)))
     assert result.table["row_gain.white_share"] == (white_share, 0.0, "1")
     assert ("row_gain.exponent" in result.names) == (white_share == 0)
     assert any("rows of a frame" in note or "mean of their frame" in note for note in result.notes)

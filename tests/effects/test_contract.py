@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -69,6 +70,7 @@ from hsnoise.model import NoiseModel, sample
 
 KEY = jax.random.key(7)
 SHAPE = (2, 4, 6)
+SCALES = np.array([1.0, 0.5], np.float32)
 FOLDER = Path(hsnoise.effects.__file__).parent
 
 # One instance of each effect, for a Bayer sensor.
@@ -150,9 +152,20 @@ def model_of(effect):
     return NoiseModel([effect, *shaped], cfa="RGGB", shutter="rolling", exposure_s=0.1)
 
 
+def scaled(model, scale):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) * scale, model)
+
+
 def arguments(effect):
     """What makes the same effect again."""
     return {name: getattr(effect, name) for name in effect.specs()} | effect.arrays() | effect.settings()
+
+
+@pytest.fixture
+def single_precision():
+    """As users draw, and the same for all tests that draw: each effect is compiled once for them."""
+    with jax.enable_x64(False):
+        yield
 
 
 def signal():
@@ -190,7 +203,7 @@ def test_no_effect_imports_another():
 
 
 @each_effect
-def test_frames_depend_on_those_before_only_in_series(effect):
+def test_frames_depend_on_those_before_only_in_series(effect, single_precision):
     light = signal()
     brighter = np.concatenate([light[:1] + 30.0, light[1:]])
     draws = [np.asarray(sample(KEY, clean, model_of(effect))) for clean in (light, brighter)]
@@ -255,7 +268,7 @@ def test_bounds_are_enforced(effect):
 
 
 @each_effect
-def test_same_key_same_draw(effect):
+def test_same_key_same_draw(effect, single_precision):
     model = model_of(effect)
     first, again = sample(KEY, signal(), model), sample(KEY, signal(), model)
     other = sample(jax.random.key(8), signal(), model)
@@ -279,37 +292,41 @@ def test_jit_is_eager(effect):
     np.testing.assert_allclose(jitted(model.effects[0]), eager, rtol=1e-12)
 
 
-@each_effect
-def test_vmap_is_a_loop(effect):
-    model = model_of(effect)
-    keys = jax.random.split(KEY, 2)
-    scales = jnp.array([1.0, 0.5])
+@cache
+def batched(name):
+    """Draws of two keys and scales, and their gradients by model and exposure: one program for two statements."""
+    (model,) = (model_of(effect) for effect in EXAMPLES if effect.name == name)
 
-    def draw(key, scale):
-        scaled = jax.tree.map(lambda leaf: leaf * scale, model)
-        return sample(key, signal(), scaled, exposure_s=0.1 * scale)
+    def smooth(model, exposure_s, key, scale):
+        drawn = sample(key, signal(), scaled(model, scale), exposure_s=exposure_s * scale, differentiable=True)
+        return jnp.tanh(drawn / 100).sum(), drawn
 
-    looped = np.stack([draw(*pair) for pair in zip(keys, scales, strict=True)])
-    # Programs that are compiled apart contract products and sums differently: another last bit of float32.
-    np.testing.assert_allclose(jax.vmap(draw)(keys, scales), looped, rtol=1e-7)
-    assert looped.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float64)
+    gradient = jax.grad(smooth, argnums=(0, 1), has_aux=True)
+    return jax.jit(jax.vmap(gradient, in_axes=(None, None, 0, 0)))(model, 0.1, jax.random.split(KEY, 2), SCALES)
 
 
 @each_effect
-def test_precision_follows_the_session(effect):
-    with jax.enable_x64(False):
-        drawn = sample(KEY, signal(), model_of(effect))  # the example's own parameters are float64
-        assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float32)
-        assert np.all(np.isfinite(drawn))
+def test_vmap_is_a_loop(effect, single_precision):
+    _, drawn = batched(effect.name)
+    for key, scale, one in zip(jax.random.split(KEY, 2), SCALES, drawn, strict=True):
+        alone = sample(key, signal(), scaled(model_of(effect), scale), exposure_s=0.1 * scale)
+        # Programs that are compiled apart contract products and sums differently: another last bit.
+        np.testing.assert_allclose(one, alone, rtol=1e-6)
 
 
 @each_effect
-def test_gradients_are_finite(effect):
-    def smooth(model, exposure_s):
-        drawn = sample(KEY, signal(), model, exposure_s=exposure_s).astype(float)
-        return jnp.tanh(drawn / 100).sum()
+def test_precision_follows_the_session(effect, single_precision):
+    drawn = sample(KEY, signal(), model_of(effect))  # the example's own parameters are float64
+    assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float32)
+    assert np.all(np.isfinite(drawn))
+    with jax.enable_x64(True):
+        drawn = jax.eval_shape(lambda: sample(KEY, signal(), model_of(effect)))
+    assert drawn.dtype == (jnp.uint16 if isinstance(effect, ADC) else jnp.float64)
 
-    gradient = jax.grad(smooth, argnums=(0, 1))(model_of(effect), 0.1)
+
+@each_effect
+def test_gradients_are_finite(effect, single_precision):
+    gradient, _ = batched(effect.name)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
