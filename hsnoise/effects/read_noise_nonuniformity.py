@@ -17,7 +17,8 @@ class ReadNoiseNonuniformity(AbstractEffect):
     """Every pixel has its own read-noise sigma, the same in all frames: log-normal, with an unchanged rms over pixels.
 
     Source followers differ in their flicker noise. The factor exp(spread z - spread^2) with z normal has mean square
-    1, so the sigma of the read noise stays its rms over pixels.
+    1, so the sigma of the read noise stays its rms over pixels. Whole rows and columns may differ likewise: rows by the
+    pixels that share a source follower, columns by their amplifiers and converters.
 
     In dark frames: variance over time differs between pixels by more than chance, equally in all exposures; the
     histogram of all pixels has heavy tails.
@@ -30,10 +31,22 @@ class ReadNoiseNonuniformity(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     measurable: ClassVar[bool] = True
     spread: Scalar = param("1", low=0, amplitude=True, doc="standard deviation of ln sigma over pixels")
+    row_spread: Scalar = param(
+        "1", low=0, default=0.0, held="at bounds", doc="the same over whole rows; simulated fits hold 0"
+    )
+    column_spread: Scalar = param(
+        "1", low=0, default=0.0, held="at bounds", doc="the same over whole columns; simulated fits hold 0"
+    )
 
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:
-        z = jax.random.normal(capture.fixed_key(self.name), (1, *shape[1:]))
-        return jnp.exp(self.spread * z - self.spread**2)
+        _, rows, columns = shape
+        spreads = {"": (self.spread, rows, columns), ".rows": (self.row_spread, rows, 1)}
+        spreads[".columns"] = (self.column_spread, 1, columns)
+        logarithm = jnp.zeros((1, 1, 1))
+        for part, (spread, *of) in spreads.items():
+            z = jax.random.normal(capture.fixed_key(self.name + part), (1, *of))
+            logarithm = logarithm + spread * z - spread**2
+        return jnp.exp(logarithm)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal unchanged: the effect that draws the read noise applies the scale."""

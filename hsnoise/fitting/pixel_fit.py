@@ -28,17 +28,18 @@ from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
-from hsnoise.statistics.pixels.read_noise import read_noise_spread
+from hsnoise.statistics.pixels.read_noise import NoiseSpread, noise_spread_of
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
-from hsnoise.statistics.pixels.structure import double_differences, low_side_sigma, plane_rows
+from hsnoise.statistics.pixels.structure import beside_neighbours, double_differences, low_side_sigma, plane_rows
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
+UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
 
@@ -57,7 +58,7 @@ class Channel:
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_spectrum: of what rows share in a frame.
-        noise_spread: standard deviation of the logarithm of read noise over pixels, with its error.
+        noise_spread: of the logarithm of read noise over pixels, rows and columns.
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
         rays: hits of single frames; None if there are none.
@@ -79,7 +80,7 @@ class Channel:
     temporal_dn2: float
     shading: Mapping[str, Shading]
     row_spectrum: RowSpectrum
-    noise_spread: tuple[float, float]
+    noise_spread: NoiseSpread
     photo_response: tuple[float, float]
     warm: Warm | None
     rays: Rays | None
@@ -168,7 +169,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c)),
-        noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else (0.0, np.inf),
+        noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else UNKNOWN_SPREAD,
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
@@ -191,8 +192,8 @@ def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, raised: f
     covariance[0, 0] += (UNSEEN * (raised - 1) * values[0]) ** 2
 
 
-def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> tuple[float, float]:
-    return read_noise_spread(found, c, read_dn2) if jumps is None else jumps.noise_spread
+def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> NoiseSpread:
+    return noise_spread_of(found, c, read_dn2, None if jumps is None else jumps.noise_spread)
 
 
 def _rays(found: Survey, c: int) -> Rays | None:
@@ -248,7 +249,9 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
         highest = group.pixels(c, "highest")
         if signal <= 0 or (highest == highest.max()).mean() > MOST_SATURATED:
             continue
-        sigma, error = offset_sigma(_blocks(found, group.of(c)), offset_dn, np.inf)
+        rows = len(found.sampled_rows) * plane_rows(found)
+        blocks = np.concatenate([double_differences(p.halves.level_dn, rows) for p in group.of(c)], axis=1)
+        sigma, error = offset_sigma(blocks, offset_dn, np.inf)
         several.append((sigma / signal, max(error / signal, 1e-9)))
     return weighted_mean(several) if several else (0.0, np.inf)
 
@@ -261,16 +264,11 @@ def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
-    """Pixel differences at the shortest exposure [half, block], and the pixels' low-side standard deviation, DN."""
-    planes, rows = shortest_of(found, c), len(found.sampled_rows) * plane_rows(found)
-    low_side = float(np.mean([low_side_sigma(plane.halves.level_dn, rows) for plane in planes]))
-    return _blocks(found, planes), low_side
-
-
-def _blocks(found: Survey, planes: list[Plane]) -> np.ndarray:
-    """Pixel differences within 2 x 2 blocks [half, block], DN."""
+    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN."""
     rows = len(found.sampled_rows) * plane_rows(found)
-    return np.concatenate([double_differences(plane.halves.level_dn, rows) for plane in planes], axis=1)
+    levels = [plane.halves.level_dn for plane in shortest_of(found, c)]
+    low_side = float(np.mean([low_side_sigma(level, rows) for level in levels]))
+    return np.concatenate([beside_neighbours(level, rows) for level in levels], axis=1), low_side
 
 
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:

@@ -175,9 +175,10 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
-    noise_spread = _mean([c.noise_spread for c in pixel.channels])
-    if noise_spread[0] > max(THERE * noise_spread[1], LEAST_NOISE_SPREAD):
-        found["read_noise_nonuniformity"] = {"spread": noise_spread}
+    differs, *of_lines = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
+    lines = {name: of for name, of in zip(("row_spread", "column_spread"), of_lines, strict=True) if of[0] > 0}
+    if lines or differs[0] > max(THERE * differs[1], LEAST_NOISE_SPREAD):
+        found["read_noise_nonuniformity"] = {"spread": differs, **lines}
     found |= {**_rays(pixel, gain), **_jumps(pixel, gain)}
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,9 +12,61 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
 MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
+TINY_DN2, OUTLYING = 1e-6, 6.0  # the last: times the median variance
 SURE = 8.0  # standard errors above which quiet pixels differ: telegraph noise that is not cut reaches 5
 NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
+FEWEST_LINES, LINES_THERE, LEAST_OF_LINES = 32, 6.0, 0.01  # the last: spread of rows or columns that matters
+
+Number = tuple[float, float]
+
+
+class NoiseSpread(NamedTuple):
+    """Standard deviation of the logarithm of read noise over single pixels, whole rows and whole columns, with errors.
+
+    What rows and columns share is not in that of pixels. An error is infinite where nothing is determined.
+    """
+
+    pixels: Number
+    rows: Number = (0.0, np.inf)
+    columns: Number = (0.0, np.inf)
+
+
+def noise_spread_of(found: Survey, channel: int, read_dn2: float, of_pixels: Number | None) -> NoiseSpread:
+    """How much read noise differs; of_pixels: over all pixels, if that is known."""
+    spread, error = read_noise_spread(found, channel, read_dn2) if of_pixels is None else of_pixels
+    rows, columns = _of_lines(found, channel, read_dn2)
+    of_lines = rows[0] ** 2 + columns[0] ** 2
+    return NoiseSpread((float(np.sqrt(max(spread**2 - of_lines, 0.0))), error), rows, columns)
+
+
+def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Number]:
+    """Spread over rows and over columns, from two mean variances of each, less outliers: 0 within chance.
+
+    Without what follows from the levels of the lines: a glow brings shot noise.
+    """
+    groups = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
+    nothing = (0.0, np.inf)
+    if not groups or read_dn2 <= 0:
+        return nothing, nothing
+    both, frames = _variances(groups, channel, np.ones(groups[0].pixels(channel, "lowest").shape, bool))
+    # Shot noise of rows with more dark signal is no read noise.
+    if min(frames) < 2 or np.median(both) > MOSTLY_READ * read_dn2:
+        return nothing, nothing
+    # Counts are whole, and so are their variances nearly: medians would jump.
+    kept = np.minimum(both, OUTLYING * np.median(both, 1, keepdims=True))
+    shape = 2, len(groups[0].of(channel)), -1, len(groups[0].of(channel)[0].column_mean_dn)
+    levels = groups[0].pixels(channel, "level_dn").reshape(shape)
+    spreads = []
+    for axis in (3, 2):
+        lines = np.log(np.mean(kept.reshape(shape), axis) + TINY_DN2) / 2
+        a, b = (lines - lines.mean(2, keepdims=True)).reshape(2, -1)
+        level = np.median(levels, axis).astype(np.float64)
+        of_level = _explained(a, b, [(level - level.mean(2, keepdims=True)).reshape(2, -1)])
+        variance, error = float(np.mean(a * b)) - of_level, float(np.std(a * b) / np.sqrt(len(a)))
+        is_there = len(a) >= FEWEST_LINES and variance > max(LINES_THERE * error, LEAST_OF_LINES**2)
+        spreads.append((float(np.sqrt(variance)), error / (2 * np.sqrt(variance))) if is_there else nothing)
+    return spreads[0], spreads[1]
 
 
 def read_noise_spread(found: Survey, channel: int, read_dn2: float) -> tuple[float, float]:

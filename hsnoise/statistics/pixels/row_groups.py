@@ -9,8 +9,8 @@ import numpy as np
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.pixels.banding import Banding, banding_of
 
-FEWEST_FRAMES, FEWEST_ROWS = 2, 64
-LARGEST = 64  # rows of a group
+FEWEST_FRAMES, FEWEST_ROWS = 2, 32
+LARGEST, FEWEST_GROUPS = 64, 4  # rows of a group; groups in the frame
 THERE = 8.0  # standard errors by which rows resemble each other more inside groups than across their edges
 EDGE = 0.5  # of the covariance inside, which is left across the edges: of what other effects add
 APART = 0.9  # of the covariance of one bank, below which another row or column is of another bank
@@ -99,7 +99,7 @@ def _error(of_frames: np.ndarray) -> float:
 def _division(products: np.ndarray, lag: int) -> tuple[float, int, int]:
     """Score, rows of a group and start of the best division, from products of rows `lag` apart [row]."""
     best = (0.0, 0, 0)
-    for size in range(2 * lag, LARGEST + 1, lag):
+    for size in range(2 * lag, min(LARGEST, len(products) // FEWEST_GROUPS) + 1, lag):
         phase = np.arange(len(products)) % size
         n, total = np.bincount(phase, minlength=size), np.bincount(phase, products, size)
         scatter = float(np.mean((products - (total / n)[phase]) ** 2))

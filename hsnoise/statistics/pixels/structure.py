@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from hsnoise.statistics.pixels.classes import HOT_SIGMAS
 from hsnoise.statistics.pixels.sample import covariance_of, median_share
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
+PIECE = 17  # pixels of a row
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: less static structure does not bias a fit that pools pixels
 GROWN = 0.1  # of the variance of the shortest exposure
@@ -61,6 +63,18 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
     a, b = maps[:, 0:height:2, :width], maps[:, 1:height:2, :width]
     block = (a - b)[..., 0::2] - (a - b)[..., 1::2]
     return block.reshape(2, -1) / np.float32(2)
+
+
+def beside_neighbours(level: np.ndarray, rows: float) -> np.ndarray:
+    """Pixels [half, pixel] less their column's median and the mean of a piece of their row, with a pixel's variance.
+
+    Smooth shading, row and column patterns cancel, as in `double_differences`; of white patterns this tells four times
+    as much, and a pattern in which neighbours resemble each other keeps its variance.
+    """
+    maps = level.reshape(2, int(rows), -1)
+    maps = maps - np.median(maps, axis=1, keepdims=True)
+    around = uniform_filter1d(maps, PIECE, axis=2)
+    return (np.sqrt(np.float32(PIECE / (PIECE - 1))) * (maps - around)).reshape(2, -1)
 
 
 def low_side_sigma(level: np.ndarray, rows: float) -> float:
