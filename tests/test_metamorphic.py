@@ -53,7 +53,7 @@ def fitted(capture: dict, **changes) -> hsnoise.FitResult:
     return hsnoise.fit(hsnoise.FrameStack(**fields))
 
 
-@pytest.fixture(scope="module", params=list(CAPTURES))
+@pytest.fixture(scope="module", params=[pytest.param("alike", marks=pytest.mark.slow), "differ"])
 def case(request):
     """A capture and its fit."""
     capture = CAPTURES[request.param]
@@ -125,6 +125,7 @@ def test_a_part_of_the_frame_tells_the_same_less_surely(case):
         assert abs(value - whole) < 4 * error and error > 0.9 * of_whole, name
 
 
+@pytest.mark.slow
 def test_a_bayer_sensor_without_its_first_row():
     capture = CAPTURES["alike"]
     before = fitted(capture)
@@ -147,6 +148,7 @@ def test_counts_doubled_are_a_gain_doubled(case):
         assert abs(again - factor * value) < 3 * np.hypot(factor * error, again_error), name
 
 
+@pytest.mark.slow
 def test_draws_of_a_saved_model_are_the_same_in_another_process(case, tmp_path):
     _, fit = case
     fit.params.save(tmp_path / "model.json")

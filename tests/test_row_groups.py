@@ -94,6 +94,7 @@ def test_other_noise_of_rows_has_no_groups(effect):
     assert "row_group_noise" not in hsnoise.fit(darks(effect), pixels="differ").added
 
 
+@pytest.mark.slow
 def test_groups_are_named_where_pixels_are_alike(key):
     alike = hsnoise.cameras.grasshopper3(black_level_dn=64)
     hidden = alike.add(RowGroupNoise(1.5, 0.1, 8, 4, 2, 2))
