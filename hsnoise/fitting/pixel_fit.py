@@ -266,9 +266,9 @@ def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
     """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN."""
     rows = len(found.sampled_rows) * plane_rows(found)
-    levels = [plane.halves.level_dn for plane in shortest_of(found, c)]
-    low_side = float(np.mean([low_side_sigma(level, rows) for level in levels]))
-    return np.concatenate([beside_neighbours(level, rows) for level in levels], axis=1), low_side
+    halves = [plane.halves for plane in shortest_of(found, c)]
+    low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
+    return np.concatenate([beside_neighbours(of.level_dn, rows) for of in halves], axis=1), low_side
 
 
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:

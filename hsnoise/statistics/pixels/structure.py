@@ -13,6 +13,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
 PIECE = 17  # pixels of a row
+LOW_SIDE_SIGMAS = 2.0  # standard errors
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: less static structure does not bias a fit that pools pixels
 GROWN = 0.1  # of the variance of the shortest exposure
@@ -77,19 +78,23 @@ def beside_neighbours(level: np.ndarray, rows: float) -> np.ndarray:
     return (np.sqrt(np.float32(PIECE / (PIECE - 1))) * (maps - around)).reshape(2, -1)
 
 
-def low_side_sigma(level: np.ndarray, rows: float) -> float:
-    """Standard deviation of the offsets of pixels [half, pixel], from those below the median, DN.
+def low_side_sigma(level: np.ndarray, rows: float, frames: int) -> float:
+    """Most that the offsets of pixels [half, pixel] may deviate, from those below the median, DN.
 
     Warm pixels only lie above it. Row and column medians are subtracted; two halves remove the noise of estimation.
+    frames: of a half. Means of so few whole counts lie on a lattice, on which quantiles would jump: they are blurred.
     """
-    maps = level.reshape(2, int(rows), -1).astype(np.float64)
+    blur = np.random.default_rng(0).uniform(-0.5, 0.5, level.shape) / frames
+    maps = (level + blur).reshape(2, int(rows), -1)
     mean = maps.mean(0)
     mean = mean - np.median(mean, axis=0, keepdims=True)
     mean = mean - np.median(mean, axis=1, keepdims=True)
     apart = (maps[0] - maps[1]) / 2
     low, middle = np.quantile(mean, (0.1587, 0.5))
     low_noise, high_noise = np.quantile(apart, (0.1587, 0.8413))
-    return float(np.sqrt(max((middle - low) ** 2 - ((high_noise - low_noise) / 2) ** 2, 0.0)))
+    whole, noise = (middle - low) ** 2, ((high_noise - low_noise) / 2) ** 2
+    error = 4 * whole / np.sqrt(mean.size)  # of the difference of two squared deviations from quantiles
+    return float(np.sqrt(max(whole - noise, 0.0) + LOW_SIDE_SIGMAS * error))
 
 
 def covariance_terms(pattern: np.ndarray) -> np.ndarray:
