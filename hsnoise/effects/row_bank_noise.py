@@ -38,6 +38,7 @@ class RowBankNoise(AbstractEffect):
 
     name: ClassVar[str] = "row_bank_noise"
     stage: ClassVar[Stage] = Stage.READ
+    selection_nats: ClassVar[float] = 15.0  # any row noise is also one of banks: two numbers more, fitted to the rows
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over rows")
     exponent: Scalar = param("1", default=1.0, doc="power falls as row frequency to minus this: 0 white, 1 is 1/f")
     shared: Scalar = param("1", low=0, high=1, default=0.0, doc="share of the variance that is common to both banks")
