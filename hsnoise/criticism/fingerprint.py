@@ -16,6 +16,7 @@ from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Simulator
 
 RELATIVE_ERROR = 0.12  # of a shift: details and interpolation
+DRAWN_ERROR = 0.05  # of a shift drawn at an amplitude that is searched further
 NEARBY_ERROR = 0.02  # of a shift drawn with parameters brought close to the capture
 SLOPE_DRAWS = 2
 STEP, REACH = 0.03, 5.0  # relative step of a base parameter, and how many such steps it may be off

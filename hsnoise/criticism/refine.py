@@ -9,7 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.criticism.fingerprint import LEVEL, NEARBY_ERROR, RELATIVE_ERROR, Bench, base_numbers, distribution_of
+from hsnoise.criticism.fingerprint import (
+    DRAWN_ERROR,
+    LEVEL,
+    NEARBY_ERROR,
+    RELATIVE_ERROR,
+    Bench,
+    base_numbers,
+    distribution_of,
+)
 from hsnoise.criticism.ranking import Evidence, Pair
 from hsnoise.effects import AbstractEffect
 from hsnoise.likelihood.parameters import Number, Parameters, of_numbers, parameters_of, read_noise_dn
@@ -69,7 +77,8 @@ def refined_pair(pair: Pair, start: Sequence[AbstractEffect], bench: Bench, evid
     """A pair with parameters refined together from `start`, and drawn together: strong effects do not just add."""
     effects = refined(start, bench, evidence)
     model = reduce(NoiseModel.add, effects, bench.model)
-    distribution = distribution_of(bench.shifts([(model, number) for number in range(PAIR_DRAWS)]), evidence.null)
+    shifts = bench.shifts([(model, number) for number in range(PAIR_DRAWS)])
+    distribution = distribution_of(shifts, evidence.null, DRAWN_ERROR)
     score, misfit = evidence.score(distribution), evidence.misfit(distribution)
     again = replace(pair, effects=(effects[0], effects[1]), score=score, misfit=misfit, distribution=distribution)
     return max(pair, again, key=lambda one: one.score)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import given
-from hsnoise.criticism.fingerprint import NEARBY_ERROR, Bench
+from hsnoise.criticism.fingerprint import DRAWN_ERROR, NEARBY_ERROR, Bench
 from hsnoise.criticism.outcomes import Side, has_sides, on_side
 from hsnoise.criticism.ranking import (
     CLOSE,
@@ -32,6 +32,7 @@ WEAK, STRONG = 0.7, 1.4  # amplitudes from which draws at the lower or the highe
 MOST_PAIRS = 2  # that are refined, two effects at once
 NEAR = 0.8  # share of the best score that makes a candidate a leader
 MANY_DETAILS = 16  # of which the leaders' best are taken
+AROUND_IT = np.linspace(0.85, 1.15, 7)  # between the amplitudes that were tried, relative to that which was drawn
 AROUND, CLOSE_DETAILS = (1.0,), 12  # amplitude, relative, at which the leaders are drawn again
 
 
@@ -92,7 +93,7 @@ class Search:
         leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
         wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
         prints = self.bench.fingerprints(wanted, MANY_DETAILS)
-        varied = [judge(of, self.evidence, np.array(of.amplitudes)) for of in prints]
+        varied = [judge(replace(of, error=DRAWN_ERROR), self.evidence, of.amplitudes[0] * AROUND_IT) for of in prints]
         again = [self.drawn_close(one.candidate(self.evidence).effect) for one in varied]
         # Not against the leaders as they were: in few draws, rare counts seem to scatter less than they do.
         better = [max(pair, key=lambda one: one.score) for pair in zip(varied, again, strict=True)]
@@ -118,9 +119,11 @@ class Search:
         found = [with_base(one, self.bench, self.evidence) for one in variants]
         best = max(found, key=lambda one: one.score)
         closer = self.drawn_close(best.start) if has_sides(effect) else first
-        # Scores of many draws are lower: in few, rare counts seem to scatter less. Far lower, the search went astray.
+        # Scores of many draws are lower: in few, rare counts seem to scatter less. Far lower, the search went astray:
+        # the effect stands for what no particular one of its kind comes near to.
         if closer.score <= NEAR * first.score:
-            return judged, None
+            left = max(first.misfit, min(closer.misfit, best.misfit))
+            return [replace(first, misfit=left), *judged[1:]], None
         closer = replace(closer, misfit=min(closer.misfit, best.misfit))
         again = _best_first([closer, *judged[1:]])
         return again, best if again[0] is closer else None
