@@ -182,7 +182,7 @@ REACTIONS = [
     (SharedRowGain(0.3, 1.0), "row x frame: correlation, same row of G-R, long exposures", 1),
     (RowNoise(1.5), "row x frame: correlation, same row of G-R, short exposures", 1),
     (RowBankNoise(1.5, 1.2), "row x frame: correlation with the next row but one of the colour, short exposures", 1),
-    (RowGroupNoise(2.5, 0.0, 8, 2), "row x frame: rows read together, short exposures", 1),
+    (RowGroupNoise(1.5, 0.0, 8, 2), "row x frame: rows read together, short exposures", 1),
     (ColumnNoise(1.0), "column x frame: correlation, same column, short exposures", 1),
     (RowFixedPattern(1.0), "static rows: correlation of exposures, profile, short and short", 1),
     (ColumnFixedPattern(0.6), "static columns: correlation of exposures, profile, short and long", 1),

@@ -91,18 +91,19 @@ def colours(sheet: Sheet, x: Exposures) -> None:
 
 def together(sheet: Sheet, x: Exposures) -> None:
     """Whether a row resembles its neighbours more inside blocks of some rows than across their edges."""
-    if x.shape[1] == 1:
+    planes, frames, rows, _ = x.shape
+    if frames == 1:
         return
-    score = np.zeros(len(x.row_frame))
+    power, most = np.square(x.row_frame).mean((1, 2, 3)), np.zeros(len(x.row_frame))
     for lag, size in product((1, 2), BLOCKS_OF_ROWS):
         alike = (x.row_frame[..., lag:] * x.row_frame[..., :-lag]).mean((1, 2))
         blocks = alike.shape[1] // size
         if blocks < FEWEST_BLOCKS or size < 2 * lag:
             continue
-        at_place = alike[:, : blocks * size].reshape(-1, blocks, size)
-        off = alike.mean(1, keepdims=True) - at_place.mean(1)
-        score = np.maximum(score, (off / (at_place.std(1) + TINY)).max(1) * np.sqrt(blocks))
-    sheet.add("row x frame", "rows read together", score, 0.6)
+        at_place = alike[:, : blocks * size].reshape(-1, blocks, size).mean(1)
+        most = np.maximum(most, (alike.mean(1, keepdims=True) - at_place).max(1) / (power + TINY))
+    error = 1 / np.sqrt((frames - 1) * planes * rows / BLOCKS_OF_ROWS[-1])
+    sheet.add("row x frame", "rows read together", most, error / 3)
 
 
 def _next(moving: np.ndarray, axis: int, lag: int = 1) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
+from hsnoise.statistics.pixels.structure import covariance_terms
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
@@ -59,11 +60,12 @@ def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Num
     levels = groups[0].pixels(channel, "level_dn").reshape(shape)
     spreads = []
     for axis in (3, 2):
-        lines = np.log(np.mean(kept.reshape(shape), axis) + TINY_DN2) / 2
+        lines = np.log(np.maximum(np.mean(kept.reshape(shape), axis), TINY_DN2)) / 2
         a, b = (lines - lines.mean(2, keepdims=True)).reshape(2, -1)
+        terms = covariance_terms(np.stack([a, b]))  # dead lines count little
         level = np.median(levels, axis).astype(np.float64)
         of_level = _explained(a, b, [(level - level.mean(2, keepdims=True)).reshape(2, -1)])
-        variance, error = float(np.mean(a * b)) - of_level, float(np.std(a * b) / np.sqrt(len(a)))
+        variance, error = float(terms.mean()) - of_level, float(terms.std() / np.sqrt(len(terms)))
         is_there = len(a) >= FEWEST_LINES and variance > max(LINES_THERE * error, LEAST_OF_LINES**2)
         spreads.append((float(np.sqrt(variance)), error / (2 * np.sqrt(variance))) if is_there else nothing)
     return spreads[0], spreads[1]
