@@ -13,7 +13,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
 PIECE = 17  # pixels of a row
-LOW_SIDE_SIGMAS = 2.0  # standard errors
+LOW_SIDE_SIGMAS = 3.0  # standard errors
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: less static structure does not bias a fit that pools pixels
 GROWN = 0.1  # of the variance of the shortest exposure
