@@ -88,12 +88,14 @@ def test_seconds_become_milliseconds(case):
     assert_same(fit, before, within=0.02, factors=per_ms)
 
 
+@pytest.mark.slow
 def test_exposures_in_another_order(case):
     capture, before = case
     fit = fitted(capture, counts=capture["counts"][::-1], exposure_s=EXPOSURE_S[::-1])
     assert_same(fit, before, within=0.02)
 
 
+@pytest.mark.slow
 def test_frames_in_another_order(case):
     """Searches begin at other frames, and followed pixels are measured by the even and the odd frames."""
     capture, before = case
@@ -116,6 +118,7 @@ def test_an_image_upside_down(case):
     assert_same(fit, before, within=0.1)
 
 
+@pytest.mark.slow
 def test_a_part_of_the_frame_tells_the_same_less_surely(case):
     capture, before = case
     parts = [one[:, 16:, :64] for one in capture["counts"]]

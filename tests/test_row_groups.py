@@ -89,7 +89,11 @@ def test_a_sinusoid_is_told_from_the_groups():
     assert abs(value - 3.0 * 1.5) < 4 * error < 1.0
 
 
-@pytest.mark.parametrize("effect", [RowNoise(3.0, 1.0), RowBankNoise(3.0, 1.2, 0.4)], ids=lambda effect: effect.name)
+@pytest.mark.parametrize(
+    "effect",
+    [pytest.param(RowNoise(3.0, 1.0), marks=pytest.mark.slow), RowBankNoise(3.0, 1.2, 0.4)],
+    ids=lambda effect: effect.name,
+)
 def test_other_noise_of_rows_has_no_groups(effect):
     assert "row_group_noise" not in hsnoise.fit(darks(effect), pixels="differ").added
 
