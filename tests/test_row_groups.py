@@ -117,3 +117,20 @@ def test_the_imx541_reads_eight_rows_at_a_time(shared_data):
     fit = hsnoise.fit(stack, pixels="differ")
     assert fit.params["row_group_noise"].settings()["rows"] == 8
     assert fit.in_dn("row_group_noise")["row_group_noise.sigma"][0] == pytest.approx(0.13, abs=0.02)
+
+
+def test_waves_and_odd_groups_of_two_banks(rng):
+    """A wave of any period goes on from group to group; three rows of two banks are not six."""
+    row = np.arange(192)[:, None]
+    for period in (3, 4, 5.5, 8, 16, 192 / 23):
+        phase = rng.uniform(0, 2 * np.pi, (FRAMES, 1, 1))
+        for wave in (np.sin(2 * np.pi * row / period + phase), np.sign(np.sin(2 * np.pi * row / period + phase))):
+            assert row_groups_of(wave + 0.1 * rng.standard_normal((FRAMES, 192, 2))) is None
+    assert row_groups_of(means(rng, 3, 1, 2, 1, shared=0.0)).layout == (3, 1, 2, 1)
+    assert row_groups_of(means(rng, 5, 1, 2, 1, shared=0.0)).layout == (5, 1, 2, 1)
+
+
+def test_groups_leave_no_offset_of_frames():
+    """So few groups do not cancel in the mean of a frame; that is no offset of its own."""
+    fit = hsnoise.fit(darks(RowGroupNoise(5.0, 0.0, 16, 4)), pixels="differ")
+    assert "row_group_noise" in fit.added and "frame_offset" not in fit.added

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rich.progress import track
 
 from hsnoise._core.output import FRAME_FORMATS, frames_file, read_image, write_atomically
 from hsnoise._core.types import cfa_tile
+from hsnoise.chain.model_file import read_model
 from hsnoise.chain.photometry import scale_to_photoelectrons
 from hsnoise.cli.loading import model_of
 from hsnoise.model import NoiseModel, sample
@@ -51,10 +53,25 @@ def run(args: argparse.Namespace) -> None:
     shape = args.shape or SAMPLE_SHAPE
     _check_memory(len(exposures_s) * args.frames, shape)
     clean = np.zeros(shape, np.float32) if args.clean is None else _clean(args.clean, args.mean_e, model)
+    if args.clean is not None and _gain_is_open(Path(args.model)):
+        warnings.warn(
+            "the fit of this model did not determine the gain: its electrons are DN, and light is drawn as if each"
+            " electron were one DN, too bright and with the wrong shot noise. Fit flats, too",
+            stacklevel=2,
+        )
     counts = draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = metadata_of(model, exposures_s, "flat" if args.clean else "dark")
     write_atomically(args.out, frames_file(suffix, counts, metadata))
     print("\n".join(_told(args.out, counts, metadata)))
+
+
+def _gain_is_open(path: Path) -> bool:
+    """Whether a model file says that the fit which wrote it did not determine the gain."""
+    if not path.is_file():
+        return False
+    provenance = read_model(path)[0].get("provenance")
+    withheld = provenance.get("withheld") if isinstance(provenance, dict) else None
+    return isinstance(withheld, list) and any(str(name).split(".")[0] == "gain" for name in withheld)
 
 
 def _check_memory(frames: int, shape: tuple[int, int]) -> None:

@@ -11,6 +11,7 @@ from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
+ALTERNATING = 0.45  # cycles per row
 PATTERNS = {
     "frame": "frame_offset",
     "row": "row_fixed_pattern",
@@ -28,6 +29,8 @@ def shortest_of(found: Survey, c: int) -> list[Plane]:
 def banding_in(found: Survey, c: int) -> tuple[str, Banding] | None:
     """The strongest sinusoid over rows or columns, and its axis: a model has one."""
     several = [pair for plane in shortest_of(found, c) for pair in plane.banding.items()]
+    if found.row_groups is not None and found.row_groups.row_banks == 2:  # even and odd rows differ: no sinusoid
+        several = [(axis, wave) for axis, wave in several if axis != "row" or wave.frequency < ALTERNATING]
     return max(several, key=lambda pair: pair[1].variance_dn2, default=None)
 
 
@@ -66,8 +69,10 @@ def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[s
     known |= {} if waves["column"] is None else {"column_x_frame": waves["column"].variance_dn2}
     scatter = {}
     if (groups := found.row_groups) is not None:
-        of_mean_dn2 = groups.of_rows_dn2(mono=found.cfa == "mono") / found.shortest.n_frames
-        scatter = {"row_x_frame": groups.variance_dn2[1]}
+        mono, frames = found.cfa == "mono", found.shortest.n_frames
+        known["frame"] = groups.of_frames_dn2(found.shape[0], mono=mono)
+        scatter = {"row_x_frame": groups.variance_dn2[1], "frame": known["frame"] * np.sqrt(2 / (frames - 1))}
+        of_mean_dn2 = groups.of_rows_dn2(mono=mono) / frames
         scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])

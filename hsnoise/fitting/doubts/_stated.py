@@ -17,6 +17,7 @@ from hsnoise.statistics.pixels.survey import Group
 BLACK_SIGMAS, BLACK_DN, EXTRAPOLATED = 5.0, 0.25, 0.5  # the last: share of the signal at the shortest exposure
 FEWEST_PILED, PILED = 20, 3.0  # pixels at the highest count, and how many times as many as just below it
 NOISY_DN = 1.0  # with less noise, counts pile up anyway
+OF_READOUT = {"row_group_noise", "row_bank_noise"}
 ROW_SIGMAS, TOGETHER = 6.0, 0.3  # the last: share of a row's noise that continues in the next row
 
 
@@ -103,7 +104,8 @@ def _mosaic(result: FitResult, seen: Evidence) -> Iterator[str]:
 def _shutter(result: FitResult, seen: Evidence) -> Iterator[str]:
     """Rows that share noise with the next row, although the shutter was given as global."""
     planes = [plane for group in seen.survey.repeated_darks for plane in group.planes]
-    if result.summary.shutter != "global" or not planes:
+    # Rows that a global shutter exposes at once may still be read together, or by two banks.
+    if result.summary.shutter != "global" or not planes or not OF_READOUT.isdisjoint(result.params.names):
         return
     shared = mean_of([plane.components["row_x_frame"] for plane in planes])
     together = mean_of([plane.rows_together[0] for plane in planes])

@@ -13,11 +13,12 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
 MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
-TINY_DN2, OUTLYING = 1e-6, 6.0  # the last: times the median variance
+TINY_DN2, OUTLYING = 1e-6, 6.0  # the last: times the median variance of a line
 SURE = 8.0  # standard errors above which quiet pixels differ: telegraph noise that is not cut reaches 5
 NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
 FEWEST_LINES, LINES_THERE, LEAST_OF_LINES = 32, 6.0, 0.01  # the last: spread of rows or columns that matters
+BESIDE_LINES = 0.5  # of their spread: a smaller one of pixels is what the difference of two nearly equal ones leaves
 
 Number = tuple[float, float]
 
@@ -38,7 +39,8 @@ def noise_spread_of(found: Survey, channel: int, read_dn2: float, of_pixels: Num
     spread, error = read_noise_spread(found, channel, read_dn2) if of_pixels is None else of_pixels
     rows, columns = _of_lines(found, channel, read_dn2)
     of_lines = rows[0] ** 2 + columns[0] ** 2
-    return NoiseSpread((float(np.sqrt(max(spread**2 - of_lines, 0.0))), error), rows, columns)
+    left = float(np.sqrt(max(spread**2 - of_lines, 0.0)))
+    return NoiseSpread((left if left > BESIDE_LINES * np.sqrt(of_lines) else 0.0, error), rows, columns)
 
 
 def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Number]:
@@ -52,15 +54,17 @@ def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Num
         return nothing, nothing
     both, frames = _variances(groups, channel, np.ones(groups[0].pixels(channel, "lowest").shape, bool))
     # Shot noise of rows with more dark signal is no read noise.
-    if min(frames) < 2 or np.median(both) > MOSTLY_READ * read_dn2:
+    if min(frames) < 2 or np.median(both, 1).max() > MOSTLY_READ * read_dn2:
         return nothing, nothing
-    # Counts are whole, and so are their variances nearly: medians would jump.
-    kept = np.minimum(both, OUTLYING * np.median(both, 1, keepdims=True))
+    share = min(read_dn2 / float(np.sqrt(np.prod(both.mean(1)))), 1.0)  # of the noise, which differs by less
     shape = 2, len(groups[0].of(channel)), -1, len(groups[0].of(channel)[0].column_mean_dn)
     levels = groups[0].pixels(channel, "level_dn").reshape(shape)
     spreads = []
     for axis in (3, 2):
-        lines = np.log(np.maximum(np.mean(kept.reshape(shape), axis), TINY_DN2)) / 2
+        # Means less outliers: counts are whole, and so are their variances nearly, so medians would jump.
+        planes = both.reshape(shape)
+        kept = np.minimum(planes, OUTLYING * np.median(planes, axis, keepdims=True))
+        lines = np.log(np.maximum(np.mean(kept, axis), TINY_DN2)) / (2 * share)
         a, b = (lines - lines.mean(2, keepdims=True)).reshape(2, -1)
         terms = covariance_terms(np.stack([a, b]))  # dead lines count little
         level = np.median(levels, axis).astype(np.float64)

@@ -13,6 +13,7 @@ FEWEST_FRAMES, FEWEST_ROWS = 2, 32
 LARGEST, FEWEST_GROUPS = 64, 4  # rows of a group; groups in the frame
 THERE = 8.0  # standard errors by which rows resemble each other more inside groups than across their edges
 EDGE = 0.5  # of the covariance inside, which is left across the edges: of what other effects add
+SURE = 3.0  # standard errors of the variance
 APART = 0.9  # of the covariance of one bank, below which another row or column is of another bank
 
 
@@ -37,6 +38,11 @@ class RowGroups(NamedTuple):
         own = same if apart % self.row_banks == 0 else other
         mean = (own + other) / 2 if mono and self.column_banks == 2 else own
         return mean * max(1 - apart / self.rows, 0.0)
+
+    def of_frames_dn2(self, rows: int, *, mono: bool) -> float:
+        """Variance that so few groups leave in the mean of a frame of `rows` rows, beyond that of independent rows."""
+        apart = range(1, self.rows) if mono else range(2, self.rows, 2)
+        return 2 * sum(self.of_rows_dn2(d, mono=mono) for d in apart) / (rows if mono else rows / 2)
 
     def of_pixels_dn2(self, *, mono: bool) -> tuple[float, float]:
         """Variance of the pixels of one colour about the means of their rows, DN^2, and its standard error."""
@@ -73,11 +79,11 @@ def row_groups_of(means_dn: np.ndarray, first_row: int = 0, wave: Banding | None
     left -= left.mean(1, keepdims=True)
     found = [(*_division(np.mean(left[:, :-lag] * left[:, lag:], (0, 2)), lag), lag) for lag in (1, 2)]
     score, size, start, lag = max(found)
-    if score < THERE:
+    if score < THERE or _goes_on(left, size):
         return None
     other_columns = left[..., ::-1]
     same, other_column = (_inside(left, other, lag, size, start, wave) for other in (left, other_columns))
-    if np.mean(same) <= 0:
+    if np.mean(same) < SURE * _error(same):
         return None
     # Groups in which the next row but one is the most alike have at least two rows of each bank.
     other_row, both = (_inside(left, other, 1, size, start, wave) for other in (left, other_columns))
@@ -87,9 +93,18 @@ def row_groups_of(means_dn: np.ndarray, first_row: int = 0, wave: Banding | None
     parts += [both] if row_banks == column_banks == 2 else []
     ratios = np.mean(parts, 0) / np.mean(same) if parts else np.ones(frames)
     shared = float(np.clip(ratios.mean(), 0.0, 1.0)), _error(ratios) if parts else np.inf
-    return RowGroups(
-        size, (start + first_row) % size, row_banks, column_banks, (float(np.mean(same)), _error(same)), shared
-    )
+    # Few frames do not tell how much they differ: at least as normal offsets of so many groups and banks.
+    banks = row_banks * column_banks
+    independent = rows / size * (frames - 1) * banks / (1 + (banks - 1) * shared[0] ** 2)
+    variance = float(np.mean(same)), max(_error(same), float(np.mean(same)) * np.sqrt(2 / independent))
+    return RowGroups(size, (start + first_row) % size, row_banks, column_banks, variance, shared)
+
+
+def _goes_on(left: np.ndarray, size: int) -> bool:
+    """Whether rows resemble, or oppose, those of the next group or the next but one: a wave, not groups."""
+    power = np.mean(left[:, :-1] * left[:, 1:]), np.mean(left[:, :-2] * left[:, 2:])
+    beyond = [np.mean(left[:, :-apart] * left[:, apart:]) for apart in (size, 2 * size)]
+    return float(np.max(np.abs(beyond))) > EDGE * float(np.max(power))
 
 
 def _error(of_frames: np.ndarray) -> float:
@@ -99,7 +114,7 @@ def _error(of_frames: np.ndarray) -> float:
 def _division(products: np.ndarray, lag: int) -> tuple[float, int, int]:
     """Score, rows of a group and start of the best division, from products of rows `lag` apart [row]."""
     best = (0.0, 0, 0)
-    for size in range(2 * lag, min(LARGEST, len(products) // FEWEST_GROUPS) + 1, lag):
+    for size in range(lag + 1, min(LARGEST, len(products) // FEWEST_GROUPS) + 1):
         phase = np.arange(len(products)) % size
         n, total = np.bincount(phase, minlength=size), np.bincount(phase, products, size)
         scatter = float(np.mean((products - (total / n)[phase]) ** 2))

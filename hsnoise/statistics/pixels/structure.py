@@ -12,7 +12,7 @@ from hsnoise.statistics.pixels.sample import covariance_of, median_share
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 WINSOR_SIGMAS = 5.0
-PIECE = 17  # pixels of a row
+PIECE = 65  # pixels of a row
 LOW_SIDE_SIGMAS = 3.0  # standard errors
 SIGNIFICANT = 5.0  # standard errors
 SMALL_SHARE = 0.01  # of the temporal variance: less static structure does not bias a fit that pools pixels
