@@ -66,6 +66,8 @@ class Sensor:
         for p in range(step * step):
             at = (slice(p // step, None, step), slice(p % step, None, step))
             offset[at], growth[at] = self._levels(at)
+        if self.grows and "black_clamp" in model:  # stays in the model, and subtracts from what grows
+            growth += np.asarray(model["black_clamp"].rate)[channel]
         charge = self._charge(growth, gain) if self.grows and "dark_current" in model else np.zeros(shape)
         read, fluctuation = self._noise(charge, gain)
         if not self.grows and "dark_current" in model:  # the fit's dark current stays, and is in the level

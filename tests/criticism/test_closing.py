@@ -155,3 +155,15 @@ def test_improve_ends_with_a_closed_model(tmp_path, monkeypatch, capsys):
     model, named = (NoiseModel.load(f"better/{name}.json") for name in ("model", "named"))
     assert "measured_map" in model and "measured_map" not in named
     assert main(["sample", "better/model.json", "--shape", "64x80", "--out", "drawn.npz"]) == 0
+
+
+def test_a_dark_signal_that_the_camera_subtracts_is_not_subtracted_twice():
+    """What grows in counts is what the camera left of the dark signal."""
+    counts = np.random.default_rng(0).integers(80, 120, (2, 8, 64, 96)).astype(np.uint16)
+    like = hsnoise.FrameStack(counts, [0.0, 2.0], black_level=100.0, shutter="global")
+    model = model_of(*BASE, fx.BlackClamp(40.0))
+    frames = draw_capture(5, model, like)
+    found = closed(model, frames)
+    drawn = draw_capture(6, found.params, frames)
+    for measured, again in zip(frames.counts, drawn.counts, strict=True):
+        assert again.mean() == pytest.approx(measured.mean(), abs=0.5)
