@@ -18,6 +18,7 @@ from hsnoise._core.types import cfa_tile
 from hsnoise.chain.model_file import read_model
 from hsnoise.chain.photometry import scale_to_photoelectrons
 from hsnoise.cli.loading import model_of
+from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.model import NoiseModel, sample
 
 SAMPLE_SHAPE = (480, 640)
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> None:
     shape = args.shape or SAMPLE_SHAPE
     _check_memory(len(exposures_s) * args.frames, shape)
     clean = np.zeros(shape, np.float32) if args.clean is None else _clean(args.clean, args.mean_e, model)
-    if args.clean is not None and _gain_is_open(Path(args.model)):
+    if args.clean is not None and _gain_is_open(Path(args.model), model):
         warnings.warn(
             "the fit of this model did not determine the gain: its electrons are DN, and light is drawn as if each"
             " electron were one DN, too bright and with the wrong shot noise. Fit flats, too",
@@ -65,13 +66,13 @@ def run(args: argparse.Namespace) -> None:
     print("\n".join(_told(args.out, counts, metadata)))
 
 
-def _gain_is_open(path: Path) -> bool:
-    """Whether a model file says that the fit which wrote it did not determine the gain."""
-    if not path.is_file():
+def _gain_is_open(path: Path, model: NoiseModel) -> bool:
+    """Whether a model's file says that the fit which wrote it did not determine the gain."""
+    if not path.is_file() or "gain" not in model:
         return False
     provenance = read_model(path)[0].get("provenance")
     withheld = provenance.get("withheld") if isinstance(provenance, dict) else None
-    return isinstance(withheld, list) and any(str(name).split(".")[0] == "gain" for name in withheld)
+    return isinstance(withheld, list) and any(number.name in withheld for number in numbers_of(model, ["gain"]))
 
 
 def _check_memory(frames: int, shape: tuple[int, int]) -> None:
