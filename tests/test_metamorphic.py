@@ -104,12 +104,14 @@ def test_frames_in_another_order(case):
     assert_same(fit, before, within=0.2 if before.transfer is None else 1.0)
 
 
+@pytest.mark.slow
 def test_a_frame_stored_in_portrait(case):
     capture, before = case
     portrait = [one.swapaxes(1, 2).copy() for one in capture["counts"]]
     assert_same(fitted(capture, counts=portrait, row_axis=1), before, within=1e-6)
 
 
+@pytest.mark.slow
 def test_an_image_upside_down(case):
     """Mirrored in both directions, an RGGB sensor is a BGGR sensor."""
     capture, before = case

@@ -31,8 +31,12 @@ def fitted(*effects, exposure_s=1e-4):
 
 @pytest.mark.parametrize(
     "spreads",
-    [{"row_spread": 0.08}, {"column_spread": 0.05}, {"spread": 0.3, "row_spread": 0.1, "column_spread": 0.06}],
-    ids=lambda spreads: " and ".join(spreads),
+    [
+        pytest.param({"row_spread": 0.08}, marks=pytest.mark.slow),
+        pytest.param({"column_spread": 0.05}, marks=pytest.mark.slow),
+        {"spread": 0.3, "row_spread": 0.1, "column_spread": 0.06},
+    ],
+    ids=["rows", "columns", "all"],
 )
 def test_lines_and_pixels_are_told_apart(spreads):
     """With noise of two counts, whose variances are nearly whole numbers."""
@@ -47,6 +51,7 @@ def test_lines_and_pixels_are_told_apart(spreads):
     assert abs(fit.in_dn("read_noise")["read_noise.sigma"][0] - 2.0) < 0.03
 
 
+@pytest.mark.slow
 def test_noise_that_is_alike_has_no_spread():
     assert "read_noise_nonuniformity" not in fitted().added
 

@@ -69,7 +69,7 @@ def darks(*effects, cfa="mono") -> hsnoise.FrameStack:
     return hsnoise.FrameStack(np.asarray(counts), 1e-4, cfa=cfa)
 
 
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("cfa", ["mono", pytest.param("RGGB", marks=pytest.mark.slow)])
 def test_groups_are_measured(cfa):
     fit = hsnoise.fit(darks(RowGroupNoise(4.0, 0.3, 8, 4, 2, 2), cfa=cfa), pixels="differ")
     assert "row_group_noise" in fit.added and not {"row_noise", "row_bank_noise"} & set(fit.added)
@@ -130,6 +130,7 @@ def test_waves_and_odd_groups_of_two_banks(rng):
     assert row_groups_of(means(rng, 5, 1, 2, 1, shared=0.0)).layout == (5, 1, 2, 1)
 
 
+@pytest.mark.slow
 def test_groups_leave_no_offset_of_frames():
     """So few groups do not cancel in the mean of a frame; that is no offset of its own."""
     fit = hsnoise.fit(darks(RowGroupNoise(5.0, 0.0, 16, 4)), pixels="differ")

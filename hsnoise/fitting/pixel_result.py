@@ -158,14 +158,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
-    if (wave := pixel.channels[0].banding) is not None:
-        amplitude, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
-        size = amplitude / g, wave[1].error_dn2 / amplitude / g
-        found["periodic_banding"] = {"amplitude": size, "frequency": (wave[1].frequency, np.inf)}
-    if (groups := pixel.row_groups) is not None:
-        sigma = float(np.sqrt(groups.variance_dn2[0]))
-        size = sigma / gain.mean(), groups.variance_dn2[1] / (2 * sigma * gain.mean())
-        found["row_group_noise"] = {"sigma": size, "shared": groups.shared}
+    found |= _waves_and_groups(pixel, gain)
     exponents = [c.row_spectrum.exponent for c in pixel.channels]
     if "row_noise" in found:
         sigma, error = found["row_noise"]["sigma"]
@@ -175,11 +168,7 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
-    differs, *of_lines = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
-    lines = {name: of for name, of in zip(("row_spread", "column_spread"), of_lines, strict=True) if of[0] > 0}
-    if lines or differs[0] > max(THERE * differs[1], LEAST_NOISE_SPREAD):
-        found["read_noise_nonuniformity"] = {"spread": differs, **lines}
-    found |= {**_rays(pixel, gain), **_jumps(pixel, gain)}
+    found |= {**_noise_spread(pixel), **_rays(pixel, gain), **_jumps(pixel, gain)}
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
     response = _mean([c.photo_response for c in pixel.channels])
@@ -194,6 +183,28 @@ def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
     return found | _hot(pixel, many)
+
+
+def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """A sinusoid over rows or columns, and rows that are read together."""
+    found = {}
+    if (wave := pixel.channels[0].banding) is not None:
+        amplitude, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
+        size = amplitude / g, wave[1].error_dn2 / amplitude / g
+        found["periodic_banding"] = {"amplitude": size, "frequency": (wave[1].frequency, np.inf)}
+    if (groups := pixel.row_groups) is not None:
+        sigma = float(np.sqrt(groups.variance_dn2[0]))
+        size = sigma / gain.mean(), groups.variance_dn2[1] / (2 * sigma * gain.mean())
+        found["row_group_noise"] = {"sigma": size, "shared": groups.shared}
+    return found
+
+
+def _noise_spread(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
+    """Read noise that differs between pixels, rows or columns: means over the colours."""
+    differs, *of_lines = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
+    lines = {name: of for name, of in zip(("row_spread", "column_spread"), of_lines, strict=True) if of[0] > 0}
+    is_there = lines or differs[0] > max(THERE * differs[1], LEAST_NOISE_SPREAD)
+    return {"read_noise_nonuniformity": {"spread": differs, **lines}} if is_there else {}
 
 
 def _with_banks(population: dict, pixel: PixelFit, model: NoiseModel | None) -> dict:
