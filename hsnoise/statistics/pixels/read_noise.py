@@ -58,11 +58,10 @@ def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Num
         return nothing, nothing
     share = min(read_dn2 / float(np.sqrt(np.prod(both.mean(1)))), 1.0)  # of the noise, which differs by less
     shape = 2, len(groups[0].of(channel)), -1, len(groups[0].of(channel)[0].column_mean_dn)
-    levels = groups[0].pixels(channel, "level_dn").reshape(shape)
+    planes, levels = both.reshape(shape), groups[0].pixels(channel, "level_dn").reshape(shape)
     spreads = []
     for axis in (3, 2):
         # Means less outliers: counts are whole, and so are their variances nearly, so medians would jump.
-        planes = both.reshape(shape)
         kept = np.minimum(planes, OUTLYING * np.median(planes, axis, keepdims=True))
         lines = np.log(np.maximum(np.mean(kept, axis), TINY_DN2)) / (2 * share)
         a, b = (lines - lines.mean(2, keepdims=True)).reshape(2, -1)

@@ -56,12 +56,18 @@ def row_means(frame: np.ndarray) -> np.ndarray:
     return np.stack([frame[:, column::2].mean(1, dtype=np.float64) for column in (0, 1)], 1)
 
 
+def shortest_repeated(stack: FrameStack) -> int | None:
+    """Number of the shortest dark exposure of several frames; None without one."""
+    repeated = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] >= FEWEST_FRAMES]
+    return min(repeated, key=lambda i: stack.exposure_s[i], default=None)
+
+
 def row_groups_in(stack: FrameStack) -> tuple[int, int, int, int] | None:
     """The layout of the groups of rows in the shortest repeated darks of a stack; None without any."""
-    repeated = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] >= FEWEST_FRAMES]
-    if not repeated:
+    shortest = shortest_repeated(stack)
+    if shortest is None:
         return None
-    means = np.stack([row_means(frame) for frame in stack.frames(min(repeated, key=lambda i: stack.exposure_s[i]))])
+    means = np.stack([row_means(frame) for frame in stack.frames(shortest)])
     wave = banding_of(means.mean(2)) if stack.cfa == "mono" else None
     found = row_groups_of(means, 0 if stack.window is None else stack.window[0], wave)
     return None if found is None else found.layout

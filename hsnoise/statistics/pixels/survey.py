@@ -15,7 +15,7 @@ from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouri
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
-from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means
+from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -67,7 +67,7 @@ class Group:
     """One exposure: its conditions, shares of clipped and saturated counts [channel], and planes.
 
     along: what pixels share of their temporal noise along rows; None if the frames do not show it.
-    row_groups: rows that are read together, in darks; None if the frames do not show any.
+    row_groups: rows that are read together; looked for in the shortest repeated darks, None if they do not show any.
     files: names of the frames' files; empty for arrays.
     """
 
@@ -156,9 +156,9 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
     cell = len(cfa_tile(stack.cfa))
     rows = sampled_rows(stack.shape, cell, stack.n_exposures, max(stack.n_frames))
     highest = 0
-    groups = []
+    groups, shortest = [], shortest_repeated(stack)
     for i in range(stack.n_exposures):
-        group, top = _group(stack, i, rows, tick)
+        group, top = _group(stack, i, rows, tick, looks_for_row_groups=i == shortest)
         groups.append(group)
         highest = max(highest, top)
     full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
@@ -172,7 +172,9 @@ def _full_scale(highest: int) -> float:
     return float(max(2**16 - 1, highest))
 
 
-def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object]) -> tuple[Group, int]:
+def _group(
+    stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object], *, looks_for_row_groups: bool
+) -> tuple[Group, int]:
     tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
     step, channels = len(tile), len(stack.channels)
     sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
@@ -185,7 +187,7 @@ def _group(stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], objec
             kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
             odd = OddLines.of(frame, step)
         kept[f] = frame[rows]
-        means += [row_means(frame)] if stack.kind[i] == "dark" else []
+        means += [row_means(frame)] if looks_for_row_groups else []
         white = np.inf if stack.white_level is None else stack.white_level
         for p in range(step * step):
             plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
