@@ -13,11 +13,15 @@ MODEL = hsnoise.cameras.grasshopper3(black_level_dn=64)
 EXPOSURE_S = (0.02, 0.05, 0.1, 0.2)
 
 
-def capture(model, seed=3, frames=4, shape=(96, 128)):
+def frames_like(model, frames=2, shape=(32, 32)):
+    """Frames of any counts."""
     rng = np.random.default_rng(0)
     counts = [rng.integers(60, 80, (frames, *shape)).astype(np.uint16) for _ in EXPOSURE_S]
-    like = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=64, cfa=model.cfa, shutter=model.shutter)
-    drawn = draw_capture(seed, model, like)
+    return hsnoise.FrameStack(counts, EXPOSURE_S, black_level=64, cfa=model.cfa, shutter=model.shutter)
+
+
+def capture(model, seed=3, frames=4, shape=(96, 128)):
+    drawn = draw_capture(seed, model, frames_like(model, frames, shape))
     return hsnoise.FrameStack(drawn.counts, EXPOSURE_S, black_level=64, cfa=model.cfa, shutter=model.shutter)
 
 
@@ -35,8 +39,8 @@ def test_clamp_and_gain_are_found_together():
 @pytest.mark.parametrize(
     ("stack", "method", "message"),
     [
-        (capture(MODEL, frames=2, shape=(32, 32)), "line", "method"),
-        (capture(MODEL, frames=2, shape=(32, 32)).select(exposures=[1]), "ml", "two or more exposures"),
+        (frames_like(MODEL), "line", "method"),
+        (frames_like(MODEL).select(exposures=[1]), "ml", "two or more exposures"),
     ],
 )
 def test_clamp_that_cannot_be_fitted_is_refused(stack, method, message):

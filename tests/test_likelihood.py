@@ -108,9 +108,9 @@ def row_integral(model, c, pixels, mean_e, sigma_e):
     ("cfa", "keywords"),
     [
         pytest.param("mono", {}, marks=pytest.mark.slow),
-        pytest.param("mono", {"black_level_dn": 20.3, "white_level_dn": 40}, marks=pytest.mark.slow),
+        ("mono", {"black_level_dn": 20.3, "white_level_dn": 40}),
         pytest.param("GBRG", {"black_level_dn": 4.0}, marks=pytest.mark.slow),
-        ("GBRG", {"black_level_dn": 4.3, "white_level_dn": 16}),
+        pytest.param("GBRG", {"black_level_dn": 4.3, "white_level_dn": 16}, marks=pytest.mark.slow),
     ],
 )
 def test_white_rows_match_brute_force(cfa, keywords):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,11 @@ from hypothesis import strategies as st
 from hsnoise.stlstm import LAYOUT, STLSTM, Convolution, convolve, enhance, from_blocks, loss, to_blocks, total_variation
 
 KEY = jax.random.key(2)
-NET = STLSTM(KEY, maps=4, kernels=(3, 5), stride=2)
+
+
+@cache
+def small_net():
+    return STLSTM(KEY, maps=4, kernels=(3, 5), stride=2)
 
 
 def video(frames, shape, batch=1, seed=0):
@@ -42,10 +48,10 @@ def test_blocks_are_undone():
 
 def test_frame_by_frame_is_the_whole_video():
     frames = video(4, (10, 12))
-    whole = NET.video(jnp.asarray(frames))
-    state = NET.init_state((10, 12))
+    whole = small_net().video(jnp.asarray(frames))
+    state = small_net().init_state((10, 12))
     for frame, expected in zip(frames, whole, strict=True):
-        out, state = NET(jnp.asarray(frame), state)
+        out, state = small_net()(jnp.asarray(frame), state)
         np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -53,7 +59,7 @@ def test_a_frame_depends_on_those_before_not_after():
     frames = video(3, (8, 8))
     changed = frames.copy()
     changed[1] += 0.5
-    one, other = (np.asarray(NET.video(jnp.asarray(f))) for f in (frames, changed))
+    one, other = (np.asarray(small_net().video(jnp.asarray(f))) for f in (frames, changed))
     np.testing.assert_array_equal(one[0], other[0])
     assert np.abs(one[2] - other[2]).max() > 1e-5
 
@@ -63,7 +69,7 @@ def test_checkpoint_changes_no_gradient():
     frames = jnp.asarray(video(3, (8, 8), batch=2))
 
     def slope(checkpoint):
-        return eqx.filter_grad(lambda net: jnp.sum(net.video(frames, checkpoint=checkpoint) ** 2))(NET)
+        return eqx.filter_grad(lambda net: jnp.sum(net.video(frames, checkpoint=checkpoint) ** 2))(small_net())
 
     for one, other in zip(jax.tree.leaves(slope(True)), jax.tree.leaves(slope(False)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
@@ -83,7 +89,7 @@ def test_any_size(rows, columns, stride):
 @pytest.mark.slow
 def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
     frames = video(2, (48, 60), seed=3)[:, 0]
-    whole, tiled = (list(enhance(NET, frames, tile=tile, margin=24)) for tile in (None, 16))
+    whole, tiled = (list(enhance(small_net(), frames, tile=tile, margin=24)) for tile in (None, 16))
     # In two frames the network sees 2 x (3 x 3 and its output) blocks of two pixels: less than 24 pixels.
     for one, other in zip(whole, tiled, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
@@ -91,7 +97,7 @@ def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
 
 def test_tiles_that_the_stride_does_not_divide_are_refused():
     with pytest.raises(ValueError, match="tile, margin: expected multiples of the stride 2, got 7"):
-        next(enhance(NET, [np.zeros((8, 8, 3))], tile=7))
+        next(enhance(small_net(), [np.zeros((8, 8, 3))], tile=7))
 
 
 @pytest.mark.slow
@@ -100,7 +106,7 @@ def test_a_few_steps_learn():
     noisy = clean + 0.2 * jax.random.normal(KEY, clean.shape)
 
     optimiser = optax.adam(1e-2)
-    net, memory, values = NET, optimiser.init(eqx.filter(NET, eqx.is_array)), []
+    net, memory, values = small_net(), optimiser.init(eqx.filter(small_net(), eqx.is_array)), []
 
     @eqx.filter_jit
     def step(net, memory):
@@ -135,9 +141,9 @@ def test_bad_sizes_are_named(arguments, name):
 
 def test_odd_sizes_keep_their_shape():
     frame = jnp.ones((7, 9, 3))
-    out, state = NET(frame, NET.init_state((7, 9)))
+    out, state = small_net()(frame, small_net().init_state((7, 9)))
     assert out.shape == frame.shape and np.isfinite(out).all()
-    assert NET(out, state)[0].shape == frame.shape
+    assert small_net()(out, state)[0].shape == frame.shape
 
 
 @pytest.mark.parametrize("arguments", [{"maps": 2.5}, {"stride": "2"}, {"kernels": 3}, {"kernels": (3.0,)}])
@@ -153,22 +159,22 @@ def test_even_kernels_are_refused():
 
 def test_frames_may_be_lists():
     frame = np.ones((8, 8, 3), np.float32)
-    state = NET.init_state((8, 8))
-    np.testing.assert_array_equal(NET(frame.tolist(), state)[0], NET(frame, state)[0])
-    np.testing.assert_array_equal(next(enhance(NET, [frame.tolist()])), next(enhance(NET, [frame])))
+    state = small_net().init_state((8, 8))
+    np.testing.assert_array_equal(small_net()(frame.tolist(), state)[0], small_net()(frame, state)[0])
+    np.testing.assert_array_equal(next(enhance(small_net(), [frame.tolist()])), next(enhance(small_net(), [frame])))
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 4), (8, 8), (1, 8, 8, 1), (0, 8, 3), (0, 8, 8, 3)])
 def test_bad_frames_are_named(shape):
     with pytest.raises(ValueError, match="frame: expected"):
-        NET(jnp.zeros(shape), NET.init_state((8, 8)))
+        small_net()(jnp.zeros(shape), small_net().init_state((8, 8)))
 
 
 def test_state_of_another_size_is_named():
     with pytest.raises(ValueError, match="state: made for"):
-        NET(jnp.zeros((8, 8, 3)), NET.init_state((8, 10)))
+        small_net()(jnp.zeros((8, 8, 3)), small_net().init_state((8, 10)))
     with pytest.raises(ValueError, match="frame 1 has shape"):
-        list(enhance(NET, [np.zeros((8, 8, 3)), np.zeros((8, 9, 3))]))
+        list(enhance(small_net(), [np.zeros((8, 8, 3)), np.zeros((8, 9, 3))]))
 
 
 def test_training_is_that_of_the_same_network_in_pytorch():

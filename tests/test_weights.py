@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -10,16 +12,19 @@ import pytest
 from hsnoise.enhance.weights import SHIPPED, load_network, read_arrays, save_network, write_arrays
 from hsnoise.stlstm import STLSTM
 
-NET = STLSTM(jax.random.key(0), maps=2, kernels=(3, 5), stride=2, channels=1)
+
+@cache
+def small_net():
+    return STLSTM(jax.random.key(0), maps=2, kernels=(3, 5), stride=2, channels=1)
 
 
 def test_a_network_comes_back_exactly(tmp_path):
     path = tmp_path / "net.eqx"
-    save_network(path, NET, {"camera": "any"})
+    save_network(path, small_net(), {"camera": "any"})
     net, about = load_network(path)
-    for one, other in zip(jax.tree.leaves(net), jax.tree.leaves(NET), strict=True):
+    for one, other in zip(jax.tree.leaves(net), jax.tree.leaves(small_net()), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert about["camera"] == "any" and net.kernels == NET.kernels and net.channels == 1
+    assert about["camera"] == "any" and net.kernels == small_net().kernels and net.channels == 1
 
 
 @pytest.mark.parametrize(
@@ -39,7 +44,7 @@ def test_a_network_comes_back_exactly(tmp_path):
 )
 def test_a_damaged_file_is_told(tmp_path, damage):
     path = tmp_path / "net.eqx"
-    save_network(path, NET, {})
+    save_network(path, small_net(), {})
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match="truncated, or changed|not a file of weights"):
         load_network(path)
@@ -48,7 +53,7 @@ def test_a_damaged_file_is_told(tmp_path, damage):
 @pytest.mark.slow
 def test_arrays_of_another_network_are_told(tmp_path):
     path = tmp_path / "net.eqx"
-    write_arrays(path, NET, {})
+    write_arrays(path, small_net(), {})
     with pytest.raises(ValueError, match="another network"):
         read_arrays(path, STLSTM(jax.random.key(0), maps=4, kernels=(3, 5), channels=1))
     with pytest.raises(ValueError, match="holds no network; give the weights.eqx"):
@@ -57,7 +62,7 @@ def test_arrays_of_another_network_are_told(tmp_path):
 
 def test_a_failed_write_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     path = tmp_path / "net.eqx"
-    save_network(path, NET, {})
+    save_network(path, small_net(), {})
     before = path.read_bytes()
 
     def full(*_):
@@ -65,7 +70,7 @@ def test_a_failed_write_leaves_the_file_as_it_was(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space"):
-        save_network(path, NET, {"more": 1})
+        save_network(path, small_net(), {"more": 1})
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
@@ -85,14 +90,14 @@ def test_a_failed_write_leaves_the_file_as_it_was(tmp_path, monkeypatch):
 )
 def test_headers_that_describe_no_network_are_told(tmp_path, network):
     path = tmp_path / "net.eqx"
-    write_arrays(path, NET, {"network": network})
+    write_arrays(path, small_net(), {"network": network})
     with pytest.raises(ValueError, match=f"{path}: its header describes no network"):
         load_network(path)
 
 
 def test_weights_that_are_not_finite_are_told(tmp_path):
     path = tmp_path / "net.eqx"
-    save_network(path, eqx.tree_at(lambda net: net.output.bias, NET, replace_fn=lambda bias: bias * np.nan), {})
+    save_network(path, eqx.tree_at(lambda net: net.output.bias, small_net(), replace_fn=lambda bias: bias * np.nan), {})
     with pytest.raises(ValueError, match="expected finite weights"):
         load_network(path)
 
