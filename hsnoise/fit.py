@@ -29,7 +29,7 @@ from hsnoise.likelihood.summary import Summary, far_outliers, summarise
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_effects, check_fits
 from hsnoise.simulation.portion import Portion
-from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ
+from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ, rows_dominate
 from hsnoise.statistics.pixels.survey import Survey, survey
 
 log = logging.getLogger(__name__)
@@ -230,7 +230,8 @@ def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
     """Whether the fit is conditional on the pixel."""
     if method == "transfer" or pixels == "differ":
         return True
-    return method != "line" and pixels == "auto" and pixels_differ(found) and can_be_transferred(found)
+    needed = pixels_differ(found) or rows_dominate(found)
+    return method != "line" and pixels == "auto" and needed and can_be_transferred(found)
 
 
 def _check_size(stack) -> None:

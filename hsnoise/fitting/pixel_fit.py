@@ -133,7 +133,10 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
     # Rounding, not light, sets the variance of narrow noise.
     pixels = levels_of(found, c, without=jumping) if narrow is None else None
-    transfer = None if pixels is None else _transfer(pixels, found, _row_gain(found, c, growth))
+    spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
+    banding = banding_in(found, c)
+    row_gain = partial(_row_gain, found, c, spectrum, banding)
+    transfer = None if pixels is None else _transfer(pixels, found, row_gain(growth))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if transfer is not None and pixels is not None:
@@ -149,8 +152,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
-    rows, shading = _row_gain(found, c, values[2]), shadings_of(found, c)
-    patterns = patterns_of(found, c, shading)
+    shading = shadings_of(found, c)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
@@ -164,17 +166,17 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         values=values,
         covariance=covariance,
         black_dn=black,
-        row_gain=rows,
-        patterns=patterns,
+        row_gain=row_gain(values[2]),
+        patterns=patterns_of(found, c, shading),
         temporal_dn2=floor,
         shading=shading,
-        row_spectrum=row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c)),
+        row_spectrum=spectrum,
         noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else UNKNOWN_SPREAD,
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
         jumps=jumps,
-        banding=banding_in(found, c),
+        banding=banding,
         subtracted=subtracted(transfer, (growth, growth_error)),
     )
 
@@ -306,13 +308,20 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Po
     return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, *_pattern(found, c))
 
 
-def _row_gain(found: Survey, c: int, growth: float) -> tuple[float, float]:
-    """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error."""
+def _row_gain(
+    found: Survey, c: int, spectrum: RowSpectrum, banding: tuple[str, Banding] | None, growth: float
+) -> tuple[float, float]:
+    """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error.
+
+    Rows that resemble each other, and bands, vary more from exposure to exposure than independent rows.
+    """
     groups = found.repeated_darks
     signal = growth * np.array([g.exposure_s for g in groups])
     parts = [[p.components["row_x_frame"] for p in g.of(c)] for g in groups]
     y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
     error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
+    of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
+    error = np.hypot(error * spectrum.widened, of_band)
     if len(groups) < 2 or np.ptp(signal) <= 0:
         return 0.0, UNKNOWN
     unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse

@@ -16,6 +16,7 @@ MOST_COUNTS = 1 << 24  # pixels times frames of one exposure in memory
 MOST_OF_SPREAD = 100_000  # pixels from which the width of a distribution is taken
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from the values within
 OUTLYING = 6.0  # deviations beyond which a pixel's temporal variance is not its noise
+MOST_LEFT = 8.0  # ratio to the expected power: of a sinusoid, one mean in 3000 has more
 NEIGHBOURS = 32  # pixels of a row that are compared with each other
 FEWEST_ROWS = 24  # enough for the offset of a column in a frame
 
@@ -89,10 +90,11 @@ def halves_of(counts: np.ndarray) -> Halves:
     n = len(counts)
     lowest, highest = counts.min(0).ravel(), counts.max(0).ravel()
     values = counts.astype(np.float32)
-    frame_means, added = _take_off_common(values)
+    frame_means, added, of_lines = _take_off_common(values)
     flat = values.reshape(n, -1)
     parts = [_moments(flat[half::2], added) for half in (0, 1)]
     level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
+    level = (level.reshape(2, *values.shape[1:]) - _left_in_lines(values.mean(0), of_lines)).reshape(2, -1)
     whole = flat.var(0, ddof=1) - added
     third, fourth = _higher(flat)
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
@@ -114,16 +116,35 @@ def _higher(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return third / np.float32(len(flat)), fourth / np.float32(len(flat))
 
 
-def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
+def _left_in_lines(mean: np.ndarray, of_lines: tuple[float, float]) -> np.ndarray:
+    """What the mean over frames [row, column] expects to hold of row and column noise, DN: the same in both halves.
+
+    Such a mean is not the level of a row's pixels, and a gain from levels would come out too small. As rows also differ
+    in truth, each is moved towards the others by the share of noise in the variance of rows; columns likewise. Bands
+    and slow noise have few degrees of freedom, and a mean may hold MOST_LEFT times what is expected. To subtract too
+    much makes a gain less certain, not wrong.
+
+    of_lines: variance of rows and of columns over frames, in the mean, DN^2.
+    """
+    left = np.zeros_like(mean)
+    for axis, noise_dn2 in zip((1, 0), of_lines, strict=True):
+        lines = np.median(mean, axis=axis, keepdims=True)
+        lines = lines - lines.mean(dtype=np.float64)
+        left += np.float32(min(MOST_LEFT * noise_dn2 / max(float(lines.var()), 1e-12), 1.0)) * lines.astype(np.float32)
+    return left
+
+
+def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[float, float]]:
     """Subtract the offsets of frames, and of rows and columns in a frame, from `values` in place.
 
     A pixel's offsets come from the other pixels of its row and column, so that none of its own noise is subtracted.
-    Returns the offsets of the frames, and the variance that the offsets' own noise adds to each pixel, DN^2.
+    Returns the offsets of the frames, the variance that the offsets' own noise adds to each pixel, and the variance of
+    rows and of columns in the mean over frames, DN^2.
     """
     n, h, w = values.shape
     mean = values.mean(0)
     spread = _core_spread(values[0] - mean) + np.float32(1e-3)
-    offsets, power = np.empty(n), 0.0
+    offsets, power, of_rows, of_columns = np.empty(n), 0.0, 0.0, 0.0
     for k, frame in enumerate(values):
         rest = np.clip(frame - mean, -CORE_SIGMAS * spread * 4, CORE_SIGMAS * spread * 4)
         offsets[k] = _clipped_mean(rest, spread)
@@ -131,14 +152,20 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32]:
         frame -= np.float32(offsets[k])
         if w > 1:
             frame -= (rest.sum(1, keepdims=True) - rest) / np.float32(w - 1)
+        of_rows += float(np.mean(rest.mean(1) ** 2))
         rest -= rest.mean(1, keepdims=True)
+        of_columns += float(np.mean(rest.mean(0) ** 2))
         if h >= FEWEST_ROWS:
             frame -= (rest.sum(0, keepdims=True) - rest) / np.float32(h - 1)
         power += float(np.mean(rest**2))
     typical = typical_offset(offsets)
     values += np.float32(typical)
     share = (1 / (w - 1) if w > 1 else 0.0) + (1 / (h - 1) if h >= FEWEST_ROWS else 0.0)
-    return offsets - typical, np.float32(power / (n - 1) * share)
+    of_pixels = power / (n - 1)
+    of_lines = tuple(
+        max(of / (n - 1) - of_pixels / of_each, 0.0) / n for of, of_each in ((of_rows, w), (of_columns, h))
+    )
+    return offsets - typical, np.float32(of_pixels * share), of_lines
 
 
 def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:

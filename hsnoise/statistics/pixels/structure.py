@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 
 from hsnoise.statistics.pixels.classes import HOT_SIGMAS
 from hsnoise.statistics.pixels.sample import covariance_of, median_share
-from hsnoise.statistics.pixels.survey import Group, Survey
+from hsnoise.statistics.pixels.survey import Group, Plane, Survey
 
 WINSOR_SIGMAS = 5.0
 PIECE = 65  # pixels of a row
@@ -20,7 +20,9 @@ GROWN = 0.1  # of the variance of the shortest exposure
 HITS = 10.0  # ratio of the mean temporal variance to that of the typical pixel
 SMALL_PATTERN = 0.001  # of the temporal variance
 MANY_HOT = 0.003  # share of hot pixels that is too large for a component of outliers
+ROWS_DOMINATE = 4.0  # ratio of the variance of rows over frames to that of pixels at the shortest exposure
 STREAKS = 0.05  # growth of the variance of row means over that of pixels, above which streaks dominate
+MOST_ALIKE = 0.99  # correlation of rows
 CLIPPED = 0.6  # share of clipped counts above which moments over time say too little about the noise
 
 
@@ -179,6 +181,17 @@ def has_patterns(found: Survey) -> bool:
     return False
 
 
+def rows_dominate(found: Survey) -> bool:
+    """Whether rows vary far more than pixels without signal.
+
+    No row gain does that, and a likelihood that explains it by one is slow and wrong.
+    """
+    if found.shortest is None or found.shortest.n_frames < 2:
+        return False
+    parts = [plane.components for plane in found.shortest.planes]
+    return all(of["row_x_frame"].variance_dn2 > ROWS_DOMINATE * of["temporal"].variance_dn2 for of in parts)
+
+
 def _always_bright(found: Survey, channel: int) -> float:
     """Share of pixels that stand out in every frame of the longest exposure, unlike hits and jumps."""
     several = found.repeated_darks
@@ -197,7 +210,19 @@ def can_be_transferred(found: Survey) -> bool:
     if not groups or max(g.clipped_share.max() for g in groups) > CLIPPED:
         return False
     # Row offsets are subtracted, but a row gain grows with the signal and changes the noise within rows.
-    streaks = [[p.components["row_x_frame"].variance_dn2 for p in g.planes] for g in groups]
-    noise = [[p.components["temporal"].variance_dn2 for p in g.planes] for g in groups]
-    grown = np.array(streaks) - np.min(streaks, axis=0)
-    return bool((grown <= STREAKS * np.array(noise)).all())
+    for planes in zip(*[g.planes for g in groups], strict=True):
+        streaks, chance = np.array([_streaks(plane) for plane in planes]).T
+        least = int(streaks.argmin())
+        noise = np.array([plane.components["temporal"].variance_dn2 for plane in planes])
+        grown = streaks - streaks[least] > np.maximum(STREAKS * noise, SIGNIFICANT * np.hypot(chance, chance[least]))
+        if grown.any():
+            return False
+    return True
+
+
+def _streaks(plane: Plane) -> tuple[float, float]:
+    """Variance of rows over frames and its error, DN^2: of fewer rows, where they resemble the next."""
+    rows = plane.components["row_x_frame"]
+    together = max(abs(of.variance_dn2) for of in plane.rows_together) / max(rows.variance_dn2, 1e-12)
+    square = min(together, MOST_ALIKE) ** 2
+    return rows.variance_dn2, rows.standard_error_dn2 * np.sqrt((1 + square) / (1 - square))
