@@ -15,6 +15,7 @@ from hsnoise.likelihood.darks import black_level
 from hsnoise.likelihood.parameters import Number, numbers_of
 from hsnoise.likelihood.summary import RowHistograms
 
+FALL_SIGMAS = 4.0  # standard errors of a level that falls with exposure
 UNDETERMINED = 0.3  # relative standard error above which a parameter is reported as undetermined
 LEAST_OUTLIERS = 5  # pixels; fewer may be chance
 MISPLACED_FRACTION = 0.03
@@ -186,9 +187,10 @@ def order_note(result: FitResult) -> list[str]:
     """Means that fall as the exposure grows."""
     for h in result.summary.histograms:
         order = np.argsort(result.summary.exposure_s, kind="stable")
-        level = _levels([h])[order]
-        if (np.diff(level) < -1).any():
-            e = int(np.diff(level).argmin())
+        level, error = _levels([h])[order], _level_errors(h)[order]
+        falls = np.diff(level) < -np.maximum(1.0, FALL_SIGMAS * np.hypot(error[1:], error[:-1]))
+        if falls.any():
+            e = int(np.where(falls, np.diff(level), 0.0).argmin())
             short, long = result.summary.exposure_s[order[[e, e + 1]]]
             described = "black_clamp" in result.params
             what = " (black_clamp)" if described else ", which this model does not describe"
@@ -266,6 +268,15 @@ def _levels(histograms: Sequence[RowHistograms]) -> np.ndarray:
     """Mean count [exposure], DN, over all these channels."""
     total = sum(h.row_sum.sum((1, 2)) for h in histograms)
     return total / np.maximum(sum(h.counts.sum((1, 2, 3), dtype=np.float64) for h in histograms), 1)
+
+
+def _level_errors(h: RowHistograms) -> np.ndarray:
+    """Standard errors of the mean counts [exposure], DN, by how frames differ."""
+    pixels = h.row_pixels.sum(2)
+    frames = h.row_sum.sum(2) / np.maximum(pixels, 1)
+    several = [of[there] for of, there in zip(frames, pixels > 0, strict=True)]
+    scatter = np.sqrt(np.mean([of.var(ddof=1) for of in several if len(of) > 1] or [0.0]))
+    return np.array([scatter / np.sqrt(max(len(of), 1)) for of in several])
 
 
 def _noise_dn(result: FitResult) -> float:

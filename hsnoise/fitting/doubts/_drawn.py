@@ -101,8 +101,8 @@ def _level(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[
     lowest = min(_median(group, c) for group, _ in pairs)
     for group, drawn in pairs:
         level, model, noise = _median(group, c), _median(drawn, c), np.sqrt(_typical(group, c)[0])
-        off = abs(level - model)
-        if off > max(LEVEL_NOISES * noise, LEVEL_SHARE * (level - lowest)):
+        off, error = abs(level - model), np.hypot(_of_frames(group, c), _of_frames(drawn, c))
+        if off > max(LEVEL_NOISES * noise, LEVEL_SHARE * (level - lowest), SIGMAS * error):
             yield (
                 off / max(noise, 1e-6),
                 f"The level of the typical pixel{of} at {seconds(group.exposure_s)} is {level:.5g} DN, but"
@@ -133,6 +133,12 @@ def _typical(group: Group, c: int) -> tuple[float, float]:
 
 def _median(group: Group, c: int) -> float:
     return float(np.median(group.pixels(c, "level_dn").mean(0)))
+
+
+def _of_frames(group: Group, c: int) -> float:
+    """Standard error of a level by how frames differ, DN."""
+    frames = np.mean([plane.frame_means_dn for plane in group.of(c)], axis=0)
+    return float(frames.std(ddof=1) / np.sqrt(len(frames)))
 
 
 def _shared_by_rows(group: Group, c: int) -> Component:

@@ -166,6 +166,7 @@ def _line(classes: Classes, sigma_dn: np.ndarray, alike: float) -> _Line | None:
     design[at, places.gain] = (signal - hot)[c, e]
     design[at, places.hot_gain] = hot[c, e]
     design[at, places.pedestal(e)] = -1
+    design[:, places.pedestal(int(classes.exposure_s.argmin()))] += 1  # signals are relative to the shortest exposure
     y, relative = classes.variance_dn2[c, e], (classes.error_dn2 / classes.variance_dn2)[c, e]
     expected, gain, floor = y.copy(), 0.0, float(np.median(y))
     for _ in range(ROUNDS):
