@@ -152,7 +152,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
-    shading = shadings_of(found, c)
+    shading = shadings_of(found, c, spectrum.widened)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.

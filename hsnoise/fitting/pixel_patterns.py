@@ -47,13 +47,21 @@ def known_of_rows(found: Survey, c: int, apart: int = 0) -> float:
     return of_wave + (0.0 if groups is None else groups.of_rows_dn2(apart, mono=found.cfa == "mono"))
 
 
-def shadings_of(found: Survey, c: int) -> dict[str, Shading]:
-    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one."""
+def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shading]:
+    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one.
+
+    widened: as in `RowSpectrum`; slow row noise drifts, too, and a few frames do not average it out.
+    """
     planes, out = shortest_of(found, c), {}
     for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
         if planes:
             noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
-            one = shading_of(np.mean([getattr(p, name) for p in planes], axis=0), float(noise))
+            means = np.mean([getattr(p, name) for p in planes], axis=0)
+            of_lines_dn2 = mean_of([p.components[f"{axis}_x_frame"] for p in planes]).variance_dn2
+            # In the shape of a shading: all of it, if a few slow waves make the noise.
+            slow = min(2 * (widened if axis == "row" else 1.0) ** 2 / len(means), 1.0)
+            chance = np.sqrt(max(of_lines_dn2, 0.0) / found.shortest.n_frames * slow)
+            one = shading_of(means, float(noise), float(chance))
             out |= {} if one is None else {axis: one}
     largest = max(out, key=lambda axis: out[axis].amplitude_dn, default=None)
     return {} if largest is None else {largest: out[largest]}

@@ -21,10 +21,10 @@ class Shading(NamedTuple):
     above: bool
 
 
-def shading_of(means_dn: np.ndarray, noise_dn: float) -> Shading | None:
+def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) -> Shading | None:
     """The shading of static row or column means [n], DN; None if it explains too little of them.
 
-    noise_dn: standard error of each mean.
+    noise_dn: standard error of each mean; chance_dn: rms of a shading that noise of lines makes in these means.
     """
     y = means_dn - means_dn.mean()
     distance = np.arange(len(y)) / max(len(y) - 1, 1)
@@ -40,7 +40,7 @@ def shading_of(means_dn: np.ndarray, noise_dn: float) -> Shading | None:
     assert best is not None
     size, length, start = best
     left = max(float((y**2).mean()) - size**2, 0.0)
-    error = float(np.sqrt((left + noise_dn**2) / len(y)))
+    error = float(np.sqrt((left + noise_dn**2) / len(y) + chance_dn**2))
     if abs(size) < THERE * error or size**2 < LEAST_SHARE * float((y**2).mean()):
         return None
     return Shading(abs(size), error, length, start, size > 0)
