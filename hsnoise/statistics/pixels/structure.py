@@ -211,18 +211,21 @@ def can_be_transferred(found: Survey) -> bool:
         return False
     # Row offsets are subtracted, but a row gain grows with the signal and changes the noise within rows.
     for planes in zip(*[g.planes for g in groups], strict=True):
-        streaks, chance = np.array([_streaks(plane) for plane in planes]).T
-        least = int(streaks.argmin())
+        streaks = np.array([plane.components["row_x_frame"].variance_dn2 for plane in planes])
         noise = np.array([plane.components["temporal"].variance_dn2 for plane in planes])
-        grown = streaks - streaks[least] > np.maximum(STREAKS * noise, SIGNIFICANT * np.hypot(chance, chance[least]))
-        if grown.any():
+        least = float(streaks.min())
+        chance = np.sqrt(2) * max(least, 0.0) * np.array([_scatter_of_rows(plane) for plane in planes])
+        if (streaks - least > np.maximum(STREAKS * noise, SIGNIFICANT * chance)).any():
             return False
     return True
 
 
-def _streaks(plane: Plane) -> tuple[float, float]:
-    """Variance of rows over frames and its error, DN^2: of fewer rows, where they resemble the next."""
+def _scatter_of_rows(plane: Plane) -> float:
+    """Relative error of the variance of rows over frames: larger where rows resemble the next, and few are independent.
+
+    By the correlations of a series that fades exponentially.
+    """
     rows = plane.components["row_x_frame"]
-    together = max(abs(of.variance_dn2) for of in plane.rows_together) / max(rows.variance_dn2, 1e-12)
-    square = min(together, MOST_ALIKE) ** 2
-    return rows.variance_dn2, rows.standard_error_dn2 * np.sqrt((1 + square) / (1 - square))
+    variance = max(rows.variance_dn2, 1e-12)
+    square = min(max(abs(of.variance_dn2) for of in plane.rows_together) / variance, MOST_ALIKE) ** 2
+    return float(rows.standard_error_dn2 / variance * np.sqrt((1 + square) / (1 - square)))
