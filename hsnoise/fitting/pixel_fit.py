@@ -21,6 +21,7 @@ from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
+from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
@@ -313,15 +314,16 @@ def _row_gain(
 ) -> tuple[float, float]:
     """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error.
 
-    Rows that resemble each other, and bands, vary more from exposure to exposure than independent rows.
+    Rows that resemble each other, bands, and noise of some frames vary more from exposure to exposure.
     """
     groups = found.repeated_darks
     signal = growth * np.array([g.exposure_s for g in groups])
-    parts = [[p.components["row_x_frame"] for p in g.of(c)] for g in groups]
-    y = np.array([np.mean([one.variance_dn2 for one in of]) for of in parts])
-    error = np.array([np.mean([one.standard_error_dn2 for one in of]) / np.sqrt(len(of)) for of in parts]) + 1e-12
+    parts = [mean_of([p.components["row_x_frame"] for p in g.of(c)]) for g in groups]
+    y = np.array([one.variance_dn2 for one in parts])
+    error = spectrum.widened * np.array([one.standard_error_dn2 for one in parts]) + 1e-12
+    by_frames = [np.mean([p.rows_error_dn2 for p in g.of(c)]) / np.sqrt(len(g.of(c))) for g in groups]
     of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
-    error = np.hypot(error * spectrum.widened, of_band)
+    error = np.maximum(np.hypot(error, of_band), by_frames)
     if len(groups) < 2 or np.ptp(signal) <= 0:
         return 0.0, UNKNOWN
     unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse

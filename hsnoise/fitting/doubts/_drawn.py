@@ -116,7 +116,8 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
     for group, drawn in pairs:
         one, other = (_shared_by_rows(side, c) for side in (group, drawn))
         off, noise = abs(one.variance_dn2 - other.variance_dn2), _typical(group, c)[0]
-        error = SIGMAS * np.hypot(one.standard_error_dn2, other.standard_error_dn2)
+        measured, chance = (np.mean([plane.rows_error_dn2 for plane in side.of(c)]) for side in (group, drawn))
+        error = SIGMAS * np.hypot(measured, chance)
         if off > max(ROW_NOISE * noise, error, ROW_SHARE * max(one.variance_dn2, other.variance_dn2)):
             yield (
                 off / max(noise, 1e-6),

@@ -143,12 +143,15 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[
     """
     n, h, w = values.shape
     mean = values.mean(0)
-    spread = _core_spread(values[0] - mean) + np.float32(1e-3)
     offsets, power, of_rows, of_columns = np.empty(n), 0.0, 0.0, 0.0
     for k, frame in enumerate(values):
-        rest = np.clip(frame - mean, -CORE_SIGMAS * spread * 4, CORE_SIGMAS * spread * 4)
-        offsets[k] = _clipped_mean(rest, spread)
-        rest = np.clip(rest - np.float32(offsets[k]), -CORE_SIGMAS * spread, CORE_SIGMAS * spread)
+        rest = frame - mean
+        spread = _core_spread(rest) + np.float32(1e-3)  # frames may differ in noise
+        offsets[k] = _middle(rest)  # and by more than any noise
+        rest = np.clip(rest - np.float32(offsets[k]), -CORE_SIGMAS * spread * 4, CORE_SIGMAS * spread * 4)
+        beyond = _clipped_mean(rest, spread)
+        offsets[k] += beyond
+        rest = np.clip(rest - np.float32(beyond), -CORE_SIGMAS * spread, CORE_SIGMAS * spread)
         frame -= np.float32(offsets[k])
         if w > 1:
             frame -= (rest.sum(1, keepdims=True) - rest) / np.float32(w - 1)
@@ -157,6 +160,7 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[
         of_columns += float(np.mean(rest.mean(0) ** 2))
         if h >= FEWEST_ROWS:
             frame -= (rest.sum(0, keepdims=True) - rest) / np.float32(h - 1)
+            rest -= rest.mean(0, keepdims=True)
         power += float(np.mean(rest**2))
     typical = typical_offset(offsets)
     values += np.float32(typical)
@@ -168,9 +172,13 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[
     return offsets - typical, np.float32(of_pixels * share), of_lines
 
 
+def _middle(rest: np.ndarray) -> float:
+    return float(np.median(rest[:: max(1, len(rest) // 64)]))
+
+
 def _clipped_mean(rest: np.ndarray, spread: np.float32) -> float:
     """Mean of the values near the median."""
-    middle = np.float32(np.median(rest[:: max(1, len(rest) // 64)]))
+    middle = np.float32(_middle(rest))
     return float(np.clip(rest, middle - CORE_SIGMAS * spread, middle + CORE_SIGMAS * spread).mean(dtype=np.float64))
 
 

@@ -145,7 +145,10 @@ def full_of_hits(found: Survey) -> bool:
 
 
 def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
-    """A shorter and a longer dark exposure, the longer darker by more than a pixel's noise, and by how much."""
+    """A shorter and a longer dark exposure, the longer darker by more than a pixel's noise, and by how much.
+
+    By no more than their frames differ is by chance.
+    """
     darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
     for one, other in zip(darks, darks[1:], strict=False):
         if other.exposure_s == one.exposure_s:
@@ -153,7 +156,11 @@ def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
         fall = np.mean(
             [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
         )
-        if fall > np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes])):
+        noise = np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes]))
+        chance = np.sqrt(
+            sum(np.mean([p.frame_means_dn.var(ddof=1) / g.n_frames for p in g.planes]) for g in (one, other))
+        )
+        if fall > max(noise, SIGNIFICANT * chance):
             return one, other, float(fall)
     return None
 
@@ -223,9 +230,10 @@ def can_be_transferred(found: Survey) -> bool:
 def _scatter_of_rows(plane: Plane) -> float:
     """Relative error of the variance of rows over frames: larger where rows resemble the next, and few are independent.
 
-    By the correlations of a series that fades exponentially.
+    By the correlations of a series that fades exponentially, and by how frames differ.
     """
     rows = plane.components["row_x_frame"]
     variance = max(rows.variance_dn2, 1e-12)
     square = min(max(abs(of.variance_dn2) for of in plane.rows_together) / variance, MOST_ALIKE) ** 2
-    return float(rows.standard_error_dn2 / variance * np.sqrt((1 + square) / (1 - square)))
+    alike = rows.standard_error_dn2 * np.sqrt((1 + square) / (1 - square))
+    return float(max(alike, plane.rows_error_dn2) / variance)

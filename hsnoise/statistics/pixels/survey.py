@@ -28,6 +28,8 @@ class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
     rows_together: covariance of a row with the next, and with the next but one, in a frame.
+    rows_error_dn2: standard error of the variance of rows over frames by how it differs from frame to frame, where that
+    exceeds the error for independent rows: slow noise, bands, and noise that is stronger in some frames.
     banding: by axis, a sinusoid over rows or columns that moves from frame to frame; of mono frames alone, as lines of
     every second row do not tell its frequency.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
@@ -40,6 +42,7 @@ class Plane:
     frame_means_dn: np.ndarray
     components: dict[str, Component]
     rows_together: tuple[Component, Component]
+    rows_error_dn2: float
     banding: dict[str, Banding]
     halves: Halves | None
     neighbours_share: float
@@ -212,19 +215,29 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plan
     n, (h, w) = sums.n_frames, sums.shape
     halves = halves_of(counts) if n > 1 else None
     row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
-    reference = float(sums.reference or 0)
+    reference, components = float(sums.reference or 0), _components(sums, halves)
     return Plane(
         channel=int(channel),
         row_mean_dn=row_frame.mean(0) + reference,
         column_mean_dn=column_frame.mean(0) + reference,
         frame_means_dn=sums.frame_means_dn,
-        components=_components(sums, halves),
+        components=components,
         rows_together=(of_neighbouring_rows(row_frame), of_neighbouring_rows(row_frame, 2)),
+        rows_error_dn2=max(components["row_x_frame"].standard_error_dn2, _by_frames(row_frame)),
         banding={} if step > 1 else _banding(row_frame, column_frame),
         halves=halves,
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )
+
+
+def _by_frames(row_frame: np.ndarray) -> float:
+    """Error of the variance of rows [frame, row] over frames, by its scatter over frames; 0 of fewer than 3."""
+    n = len(row_frame)
+    if n < 3:
+        return 0.0
+    of_frames = (row_frame - row_frame.mean(0)).var(1) * n / (n - 1)
+    return float(of_frames.std(ddof=1) / np.sqrt(n))
 
 
 def _banding(row_frame: np.ndarray, column_frame: np.ndarray) -> dict[str, Banding]:
