@@ -62,7 +62,8 @@ class Portion:
         window = part.window or ((0, first, rows, columns) if end - first < columns else None)
         left_out = []
         if single and "flat" in kinds:
-            left_out.append(f"{len(single)} flats of a single frame were not compared: one frame cannot separate noise from light")
+            flats = f"{len(single)} flats of a single frame"
+            left_out.append(f"{flats} were not compared: one frame cannot separate noise from light")
         if bright:
             left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
         if end - first < columns:
