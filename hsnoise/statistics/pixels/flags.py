@@ -12,6 +12,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 FLAGS = {"stuck": 1, "dead": 2, "hot": 4, "telegraph": 8}  # bits of a map
 DIM = 0.5  # of the median response of its neighbours: below it a pixel is dead
 LIT_SIGMAS = 5.0  # a signal below this, in units of a level's noise, is no light
+FEWEST = 20  # pixels of a class
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
 
 
@@ -73,14 +74,17 @@ def _jumping(groups: tuple[Group, ...], channel: int, pixels: int) -> np.ndarray
 
 
 def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Typical variance of pixels of about the same level [pixel]: their mean below the 90 % quantile."""
+    """Typical variance of pixels of a level [pixel]: of classes the mean below the 90 % quantile, interpolated.
+
+    Pixels brighter than the last class that has enough of them follow the growth up to it, as shot noise does.
+    """
     edges = np.unique(np.quantile(level, np.concatenate([[0, 0.5, 0.9], 1 - np.geomspace(0.05, 1e-4, 10)])))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, len(edges) - 1)
-    typical = np.empty(len(edges))
-    for i in range(len(edges)):
-        inside = variance[number == i]
-        typical[i] = np.minimum(inside, np.quantile(inside, 0.9)).mean() if inside.size > 20 else np.nan
-    known = np.flatnonzero(np.isfinite(typical))
-    if not known.size:
+    classes = [number == i for i in range(len(edges))]
+    classes = [inside for inside in classes if np.count_nonzero(inside) > FEWEST]
+    if not classes:
         return np.full(len(level), np.median(variance))
-    return np.interp(np.arange(len(edges)), known, typical[known])[number]
+    at = np.array([level[inside].mean() for inside in classes])
+    typical = np.array([np.minimum(v, np.quantile(v, 0.9)).mean() for v in (variance[inside] for inside in classes)])
+    growth = max((typical[-1] - typical[0]) / (at[-1] - at[0]), 0.0) if len(at) > 1 else 0.0
+    return np.interp(level, at, typical) + growth * np.maximum(level - at[-1], 0)
