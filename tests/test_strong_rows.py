@@ -64,6 +64,14 @@ def test_the_gain_is_that_of_the_pixels(rows, sigma_dn, seed):
     assert found.conclusion.light == Light.GREEN and not {"black_clamp", "black_shading"} & set(found.added)
 
 
+def test_column_noise_is_no_part_of_the_read_noise():
+    """What the subtracted offsets add to a pixel was taken with the columns in it: read noise came out 9 % low."""
+    turned = capture(white, 15.0, 0.6)
+    found = hsnoise.fit(hsnoise.FrameStack([c.swapaxes(1, 2) for c in turned.counts], EXPOSURE_S, shutter="global"))
+    value, error, _ = found.table["read_noise.sigma"]
+    assert "column_noise" in found.added and abs(value - READ_E) < 4 * error and error < 0.02 * READ_E
+
+
 @pytest.mark.parametrize("rows", [white, pytest.param(walk, marks=pytest.mark.slow)])
 def test_pixels_that_are_alike_are_followed_too(rows):
     """A likelihood would explain such rows by a row gain, after minutes."""

@@ -193,7 +193,7 @@ def rows_dominate(found: Survey) -> bool:
 
     No row gain does that, and a likelihood that explains it by one is slow and wrong.
     """
-    if found.shortest is None or found.shortest.n_frames < 2:
+    if found.shortest is None:
         return False
     parts = [plane.components for plane in found.shortest.planes]
     return all(of["row_x_frame"].variance_dn2 > ROWS_DOMINATE * of["temporal"].variance_dn2 for of in parts)
