@@ -321,9 +321,8 @@ def _row_gain(
     parts = [mean_of([p.components["row_x_frame"] for p in g.of(c)]) for g in groups]
     y = np.array([one.variance_dn2 for one in parts])
     error = spectrum.widened * np.array([one.standard_error_dn2 for one in parts]) + 1e-12
-    by_frames = [np.mean([p.rows_error_dn2 for p in g.of(c)]) / np.sqrt(len(g.of(c))) for g in groups]
     of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
-    error = np.maximum(np.hypot(error, of_band), by_frames)
+    error = np.maximum(np.hypot(error, of_band), [g.rows_error_dn2(c) for g in groups])
     if len(groups) < 2 or np.ptp(signal) <= 0:
         return 0.0, UNKNOWN
     unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse

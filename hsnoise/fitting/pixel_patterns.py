@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hsnoise.statistics.decomposition import Component, mean_of
+from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
 ALTERNATING = 0.45  # cycles per row
+MEDIAN_EFFICIENCY = 0.37  # of the median deviation, for normal values
 PATTERNS = {
     "frame": "frame_offset",
     "row": "row_fixed_pattern",
@@ -68,17 +69,32 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
     return {} if largest is None else {largest: out[largest]}
 
 
-def _beside_the_next(planes: Sequence[Plane], axis: str, whole: Component) -> Component:
-    """The static variance of lines by what the typical one differs from the next, in which a shading cancels.
+def _beside_the_shading(planes: Sequence[Plane], axis: str, shading: Shading, frames: int) -> tuple[float, float]:
+    """Static variance of the typical line beside a drift and its standard error, DN^2.
 
-    Of any shape, and where it is steep.
+    Lines lie off as a whole where the drift is steep or of another shape; others have a defect.
     """
-    means = [getattr(plane, f"{axis}_mean_dn") for plane in planes]
-    differ = float(np.mean([0.5 * (1.4826 * np.median(np.abs(np.diff(of)))) ** 2 for of in means]))
-    noise = float(np.mean([of.var(ddof=1) for of in means])) - whole.variance_dn2
-    # Differences that overlap tell as much as two thirds of the lines, medians as much as 37 % of them.
-    error = differ * float(np.sqrt(3 / (0.37 * len(means) * len(means[0]))))
-    return replace(whole, variance_dn2=differ - noise, standard_error_dn2=error)
+    left, noise = [], []
+    for plane in planes:
+        left.append(_typical_dn2(shading.left_of(getattr(plane, f"{axis}_mean_dn"))))
+        over_frames = plane.components[f"{axis}_x_frame"].variance_dn2
+        noise.append(_noise_of_line_dn2(plane, axis) + max(over_frames, 0.0) / frames)
+    typical, lines = float(np.mean(left)), sum(len(getattr(plane, f"{axis}_mean_dn")) for plane in planes)
+    return typical - float(np.mean(noise)), typical * float(np.sqrt(2 / (MEDIAN_EFFICIENCY * lines)))
+
+
+def _noise_of_line_dn2(plane: Plane, axis: str) -> float:
+    """What typical pixels, static and over time, scatter the static mean of a line, DN^2."""
+    level = plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
+    level -= np.median(level, axis=0)
+    level -= np.median(level, axis=1, keepdims=True)
+    across = plane.row_mean_dn if axis == "column" else plane.column_mean_dn
+    return _typical_dn2(level) / len(across)
+
+
+def _typical_dn2(values: np.ndarray) -> float:
+    """Variance of normal values with the same median deviation."""
+    return float((1.4826 * np.median(np.abs(values - np.median(values)))) ** 2)
 
 
 def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
@@ -98,7 +114,9 @@ def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[s
         scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
-        shared = _beside_the_next(planes, component, shared) if component in shading else shared
+        if component in shading:
+            variance, error = _beside_the_shading(planes, component, shading[component], found.shortest.n_frames)
+            shared = replace(shared, variance_dn2=variance, standard_error_dn2=error)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
         out[effect] = (

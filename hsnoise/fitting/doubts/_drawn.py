@@ -101,7 +101,7 @@ def _level(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[
     lowest = min(_median(group, c) for group, _ in pairs)
     for group, drawn in pairs:
         level, model, noise = _median(group, c), _median(drawn, c), np.sqrt(_typical(group, c)[0])
-        off, error = abs(level - model), np.hypot(_of_frames(group, c), _of_frames(drawn, c))
+        off, error = abs(level - model), np.hypot(group.level_error_dn(c), drawn.level_error_dn(c))
         if off > max(LEVEL_NOISES * noise, LEVEL_SHARE * (level - lowest), SIGMAS * error):
             yield (
                 off / max(noise, 1e-6),
@@ -116,8 +116,7 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
     for group, drawn in pairs:
         one, other = (_shared_by_rows(side, c) for side in (group, drawn))
         off, noise = abs(one.variance_dn2 - other.variance_dn2), _typical(group, c)[0]
-        measured, chance = (np.mean([plane.rows_error_dn2 for plane in side.of(c)]) for side in (group, drawn))
-        error = SIGMAS * np.hypot(measured, chance)
+        error = SIGMAS * np.hypot(group.rows_error_dn2(c), drawn.rows_error_dn2(c))
         if off > max(ROW_NOISE * noise, error, ROW_SHARE * max(one.variance_dn2, other.variance_dn2)):
             yield (
                 off / max(noise, 1e-6),
@@ -134,12 +133,6 @@ def _typical(group: Group, c: int) -> tuple[float, float]:
 
 def _median(group: Group, c: int) -> float:
     return float(np.median(group.pixels(c, "level_dn").mean(0)))
-
-
-def _of_frames(group: Group, c: int) -> float:
-    """Standard error of a level by how frames differ, DN."""
-    frames = np.mean([plane.frame_means_dn for plane in group.of(c)], axis=0)
-    return float(frames.std(ddof=1) / np.sqrt(len(frames)))
 
 
 def _shared_by_rows(group: Group, c: int) -> Component:

@@ -20,6 +20,11 @@ class Shading(NamedTuple):
     start: str
     above: bool
 
+    def left_of(self, means_dn: np.ndarray) -> np.ndarray:
+        """What of static row or column means [n] it does not explain, DN."""
+        drift = self.amplitude_dn * _shape(len(means_dn), self.start, self.length)
+        return means_dn - means_dn.mean() - (drift if self.above else -drift)
+
 
 def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) -> Shading | None:
     """The shading of static row or column means [n], DN; None if it explains too little of them.
@@ -27,14 +32,10 @@ def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) ->
     noise_dn: standard error of each mean; chance_dn: rms of a shading that noise of lines makes in these means.
     """
     y = means_dn - means_dn.mean()
-    distance = np.arange(len(y)) / max(len(y) - 1, 1)
     best = None
     for start in ("first", "last"):
         for length in LENGTHS:
-            shape = np.exp(-(distance if start == "first" else distance[::-1]) / length)
-            shape = shape - shape.mean()
-            shape /= np.sqrt((shape**2).mean())
-            size = float((shape * y).mean())
+            size = float((_shape(len(y), start, length) * y).mean())
             if best is None or abs(size) > abs(best[0]):
                 best = size, length, start
     assert best is not None
@@ -44,3 +45,11 @@ def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) ->
     if abs(size) < THERE * error or size**2 < LEAST_SHARE * float((y**2).mean()):
         return None
     return Shading(abs(size), error, length, start, size > 0)
+
+
+def _shape(lines: int, start: str, length: float) -> np.ndarray:
+    """A drift [line] of mean 0 and mean square 1."""
+    distance = np.arange(lines) / max(lines - 1, 1)
+    shape = np.exp(-(distance if start == "first" else distance[::-1]) / length)
+    shape -= shape.mean()
+    return shape / np.sqrt((shape**2).mean())

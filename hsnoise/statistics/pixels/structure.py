@@ -157,9 +157,8 @@ def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
             [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
         )
         noise = np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes]))
-        chance = np.sqrt(
-            sum(np.mean([p.frame_means_dn.var(ddof=1) / g.n_frames for p in g.planes]) for g in (one, other))
-        )
+        channels = {p.channel for p in one.planes}
+        chance = np.sqrt(sum(np.mean([g.level_error_dn(c) ** 2 for c in channels]) for g in (one, other)))
         if fall > max(noise, SIGNIFICANT * chance):
             return one, other, float(fall)
     return None

@@ -93,6 +93,16 @@ class Group:
         """An attribute of `Halves` of all sampled pixels of a channel, [half, pixel] or [pixel]."""
         return np.concatenate([getattr(plane.halves, name) for plane in self.of(channel)], axis=-1)
 
+    def level_error_dn(self, channel: int) -> float:
+        """Standard error of a channel's level by how its frames differ, DN; 0 of one frame."""
+        frames = np.mean([plane.frame_means_dn for plane in self.of(channel)], axis=0)
+        return float(frames.std(ddof=1) / np.sqrt(self.n_frames)) if self.n_frames > 1 else 0.0
+
+    def rows_error_dn2(self, channel: int) -> float:
+        """Standard error of the variance of rows over frames; rows of a channel's planes are independent."""
+        planes = self.of(channel)
+        return float(np.mean([plane.rows_error_dn2 for plane in planes]) / np.sqrt(len(planes)))
+
     @property
     def noise_dn(self) -> float:
         """Temporal noise of the typical pixel, from two or more frames; 0 where rounding hides it."""
