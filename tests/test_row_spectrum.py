@@ -190,7 +190,8 @@ def test_a_free_share_is_fitted_together_with_an_added_effect():
     assert max(abs(found[name]) for name in ("gain", "row_gain.white_share", "row_noise.sigma")) < 4, found
 
 
-@pytest.mark.parametrize("white_share", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("white_share", [0.0, 1.0])
 def test_the_likelihood_tells_white_rows_from_flat_ones_of_mean_one(white_share):
     """White rows move the mean of a frame: it would be called frame_offset."""
     result = hsnoise.fit(capture(camera(0.0, white_share)))

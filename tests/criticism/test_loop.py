@@ -56,7 +56,7 @@ def test_own_samples_have_error_one():
 @pytest.mark.parametrize(
     ("effect", "group"),
     [
-        (fx.RowNoise(1.0), {"row x frame", "row spectrum", "noise"}),
+        pytest.param(fx.RowNoise(1.0), {"row x frame", "row spectrum", "noise"}, marks=pytest.mark.slow),
         (fx.DarkSignalNonuniformity(1.5), {"static pixels", "noise"}),
         (fx.FrameOffset(1.0), {"frames over time"}),
         pytest.param(fx.ColumnFixedPattern(1.0), {"static columns"}, marks=pytest.mark.slow),
