@@ -108,14 +108,13 @@ def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
         return set(seen)
 
     monkeypatch.setattr(drawing, "draw_capture", draw_capture)
-    monkeypatch.setattr(held_out, "DRAWS", 8)
     truth = MODEL.add(fx.RowNoise(4.0))
     portion = Portion.of(real(5, truth, empty_stack(6, (32, 48))))
     base = hsnoise.fit(portion.frames, model=MODEL, pixels="alike")
     tuned = keys_of(lambda: diagnosed(MODEL, portion, draws=16, seed=0, tick=lambda: None))
     refitted = keys_of(lambda: fit_synthetic(base, portion, base.params.add(fx.RowNoise(3.0))))
     judged = keys_of(lambda: compared(truth, portion, draws=8, seed=0))
-    unseen = keys_of(lambda: held_out.log_likelihood(truth, portion, 0))
+    unseen = keys_of(lambda: held_out.log_likelihood(truth, portion, 0, draws=8))
     for one, other in combinations([tuned, refitted, judged, unseen], 2):
         assert one and other and not one & other
 

@@ -33,9 +33,16 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     return sentences.frames_apart(kept, held_out.n_frames)
 
 
-def log_likelihood(model: NoiseModel, portion: Portion, seed: int, purpose: Purpose = Purpose.HELD_OUT) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats."""
+def log_likelihood(
+    model: NoiseModel, portion: Portion | None, seed: int, purpose: Purpose = Purpose.HELD_OUT, draws: int = DRAWS
+) -> float:
+    """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats.
+
+    NaN without a portion: there were too few frames to hold some out.
+    """
+    if portion is None:
+        return float("nan")
     simulator = Simulator(model, portion, key_for(seed, purpose))
-    own = simulator.reference(model, DRAWS)
+    own = simulator.reference(model, draws)
     z = own.z(simulator.measured.values)
     return float(own.distribution.log_density(z) - np.log(own.deviation).sum())

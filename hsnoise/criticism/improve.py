@@ -49,7 +49,7 @@ from hsnoise.simulation.simulator import Purpose
 log = logging.getLogger(__name__)
 
 MOST_TRIED = 4  # effects, where none explains all
-PASSING = 12  # draws for a comparison that nothing depends on, of a model that is far off
+PASSING = 12  # draws to judge a model that is far off, on which nothing depends
 
 
 def improve(
@@ -193,7 +193,7 @@ class _Work:
     def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
         """Diagnose the last step, and append one more; if there is none, how the story ends.
 
-        Raises TimeIsUp at the first draw after the limit; `steps` are then unchanged, except for a diagnosis.
+        TimeIsUp, at the first draw after the limit, leaves `steps` unchanged, except for a diagnosis.
         """
         last = steps[-1]
         tick = self.counter(_stage("looking for what is missing", steps))
@@ -233,7 +233,7 @@ class _Work:
         comparison = compared(result.params, self.portion, draws=draws, seed=self.seed, tick=tick)
         comparison = with_shares(comparison, result.params, self.portion, self.seed)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
-        unseen = float("nan") if self.held_out is None else log_likelihood(result.params, self.held_out, self.seed)
+        unseen = log_likelihood(result.params, self.held_out, self.seed, draws=draws)
         return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
 
     def started(self, first: FitResult) -> list[Step]:
