@@ -131,8 +131,8 @@ def test_a_fit_adds_it_and_keeps_gain_and_read_noise():
     stack = drawn(fx.CorrelatedReadNoise(0.3, 0.5, 0.4), (0.0, 20.0, 60.0), more=hot)
     result = hsnoise.fit(stack)
     assert "correlated_read_noise" in result.added
-    (told,) = (note for note in result.notes if "Neighbours along a row share -" in note)
-    assert abs(float(told.partition("share ")[2].partition("%")[0]) + 100 * 0.3 * 0.4) < 2
+    (told,) = (note for note in result.notes if "neighbours along a row is correlated by -" in note)
+    assert abs(float(told.partition("correlated by ")[2].partition(" %")[0]) + 100 * 0.3 * 0.4) < 2
     truth = {"gain": 0.5, "read_noise.sigma": 12.0, "correlated_read_noise.share": 0.3}
     for name, true in truth.items():
         value, error, _ = result.table[name]

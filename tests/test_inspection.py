@@ -128,6 +128,19 @@ def test_a_camera_that_subtracts_its_dark_current(rng):
     assert "does the camera subtract dark current?" in findings(counts, [0, 4, 8])
 
 
+@pytest.mark.parametrize("axis, lines", [(1, "Rows"), (2, "Columns")])
+@pytest.mark.parametrize("sigma_e, odd", [(2.0, False), (6.0, True)])
+def test_lines_that_move_together_are_no_read_noise_of_pixels(rng, axis, lines, sigma_e, odd):
+    together = rng.normal(0, GAIN * sigma_e, [8, *(n if i == axis else 1 for i, n in enumerate(SHAPE, 1))])
+    counts = (darks(rng, 0) + together).round().clip(0).astype(np.uint16)
+    found = hsnoise.inspect(counts, exposure_s=[0])
+    (read_noise,) = (said for said in found.determined if said.startswith("Read noise"))
+    assert f"DN shared by {lines.lower()}" in read_noise
+    pixel = float(read_noise.split("of which ")[1].split()[0])
+    assert pixel == pytest.approx(GAIN * READ_E, rel=0.03)
+    assert odd == any(said.startswith(f"{lines} of the shortest darks change") for said in found.findings)
+
+
 def test_clipping_and_scaled_counts(rng):
     clipped = np.maximum(darks(rng, 0).astype(int) - 196, 0).astype(np.uint16)
     assert "Counts at 0 (black is clipped)" in findings([clipped, darks(rng, 4)], [0, 4])

@@ -17,6 +17,8 @@ CERTAIN, ROUGH = 0.1, 0.5  # relative errors of a gain
 BEYOND_DOUBT = 20.0  # standard errors of a growth
 RISES_DN = 0.2  # of the mean, from the shortest to the longest exposure
 HOTTER_DN, HOTTER = 5.0, 1.5  # by which hot pixels rise
+NOTABLE = 0.5  # rms of what rows or columns share, over that of single pixels, that is told beside the noise
+SHARED = {"row_x_frame": "rows", "column_x_frame": "columns"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ def judged(
     relative = growth_error(budget)
     determined = (
         _gain_sentence(gain, flats, relative, repeated),
-        _read_noise_sentence(repeated, gain is not None or relative < CERTAIN),
+        _read_noise_sentence(repeated, gain is not None or relative < CERTAIN, budget),
         _dark_current_sentence(repeated, relative),
     )
     following = against[1] if against else _next_capture(gain, flats, darks, repeated, relative)
@@ -78,6 +80,35 @@ def about_growth(budget: NoiseBudget | None) -> list[str]:
     if budget is None or mean_rises(budget) or growth_error(budget) > CERTAIN:
         return []
     return ["The noise of the darks grows with exposure, but not their mean: does the camera subtract dark current?"]
+
+
+def about_shared_noise(budget: NoiseBudget | None) -> list[str]:
+    """Rows or columns that vary more over time than single pixels."""
+    parts = _shared_noise(budget)
+    if parts is None:
+        return []
+    pixel, shared = parts
+    return [
+        f"{what.capitalize()} of the shortest darks change from frame to frame by {noise:.3g} DN as a whole, single"
+        f" pixels only by {pixel:.3g} DN"
+        for what, noise in shared.items()
+        if noise > pixel
+    ]
+
+
+def _shared_noise(budget: NoiseBudget | None) -> tuple[float, dict[str, float]] | None:
+    """Noise of single pixels of the shortest repeated darks, and what lines share, if notable, DN; mean of colours."""
+    rows = [] if budget is None else [row for row in budget.rows if row.kind == "dark" and row.n_frames > 1]
+    if not rows:
+        return None
+    shortest = min(row.exposure_s for row in rows)
+    rows = [row for row in rows if row.exposure_s == shortest]
+    rms = {
+        name: float(np.sqrt(max(np.mean([row.components[name].variance_dn2 for row in rows]), 0.0)))
+        for name in ("temporal", *SHARED)
+    }
+    pixel = rms.pop("temporal")
+    return pixel, {SHARED[name]: noise for name, noise in rms.items() if noise > NOTABLE * pixel}
 
 
 def _against_a_fit(
@@ -127,12 +158,15 @@ def _gain_sentence(gain: Gain | None, flats: Sequence[GroupFacts], relative: flo
     return f"Gain: no; there are no flats in pairs, and {why}"
 
 
-def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool) -> str:
+def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool, budget: NoiseBudget | None) -> str:
     if not repeated:
         return "Read noise: no; no dark exposure has two frames"
     first = min(repeated, key=lambda group: group.exposure_s)
     unit = "in DN and in electrons" if has_gain else "in DN only, since the gain is unknown"
-    return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN"
+    parts = _shared_noise(budget)
+    rest = "".join(f", {noise:.3g} DN shared by {what}" for what, noise in parts[1].items()) if parts else ""
+    of_which = f", of which {parts[0]:.3g} DN of single pixels{rest}" if parts and rest else ""
+    return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN{of_which}"
 
 
 def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> str:
@@ -164,12 +198,12 @@ def _next_capture(
         return "Darks: bias frames (0 s) and two longer exposures, eight frames of each."
     single = [group.name for group in darks if group.n_frames == 1]
     if single:
-        return f"More frames of the {', '.join(single)}: one frame cannot show noise; eight are good."
+        return f"Eight frames of the {', '.join(single)} instead of one, which cannot show noise."
     if len({group.exposure_s for group in darks}) < 2:
         return "Darks of a long exposure (30 to 300 s on a cooled camera), eight frames: dark current and hot pixels."
     few = [group.name for group in darks if group.n_frames < 8]
     if few:
-        return f"More frames of the {', '.join(few[:3])}: eight or more show what changes from frame to frame."
+        return f"Eight or more of the {', '.join(few[:3])}: they show what changes from frame to frame."
     if gain is None:
         return "Flats in pairs at five brightnesses: they would confirm the gain from the darks."
     if relative >= ROUGH:

@@ -16,7 +16,7 @@ from hsnoise.criticism.budget import NoiseBudget, budget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.criticism.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.criticism.inspection._odd import odd_frames
-from hsnoise.criticism.inspection._verdict import about_growth, judged
+from hsnoise.criticism.inspection._verdict import about_growth, about_shared_noise, judged
 from hsnoise.frames.describing import levels_of, size_of
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
@@ -132,6 +132,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         *_coarse(groups),
         *_overscan(stack, facts),
         *about_growth(main_budget),
+        *about_shared_noise(main_budget),
         *about_gain(gain, stack.stated_gain),
     ]
     if is_mosaic:

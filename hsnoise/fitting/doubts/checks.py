@@ -280,11 +280,9 @@ def _of_neighbours(result: FitResult) -> Iterator[str]:
     if ringing is not None and "correlated_read_noise" in result.params:
         share = ringing.share[0] * ringing.memory[0] * np.cos(2 * np.pi * ringing.frequency[0])
         unlit = result.summary.flats is None and not result.summary.exposure_s.any()
-        signal = (
-            "; whether they share their signal, too, only lit frames show" if unlit else ", but not of the shot noise"
-        )
+        signal = "; whether their signal is, too, only lit frames show" if unlit else "; their shot noise is not"
         yield (
-            f"Neighbours along a row share {share:+.1%} of the variance of the read noise{signal}"
+            f"The read noise of neighbours along a row is correlated by {100 * share:+.2g} %{signal}"
             " (correlated_read_noise)."
         )
 
