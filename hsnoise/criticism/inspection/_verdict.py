@@ -104,7 +104,7 @@ def _shared_noise(budget: NoiseBudget | None) -> tuple[float, dict[str, float]] 
     shortest = min(row.exposure_s for row in rows)
     rows = [row for row in rows if row.exposure_s == shortest]
     rms = {
-        name: float(np.sqrt(max(np.mean([row.components[name].variance_dn2 for row in rows]), 0.0)))
+        name: max(float(np.mean([row.components[name].variance_dn2 for row in rows])), 0.0) ** 0.5
         for name in ("temporal", *SHARED)
     }
     pixel = rms.pop("temporal")
