@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import zlib
 
 import jax
@@ -13,6 +14,8 @@ import hsnoise
 from benchmarks.pixel_simulator import DETERMINED, UNDETERMINED, draw
 from hsnoise._core.types import StatedGain
 from hsnoise.effects import ADC, BlackLevel, Gain, HotPixels, ReadNoise, ShotNoise
+from hsnoise.fitting.pixel_levels import subtracted
+from hsnoise.fitting.pixel_result import SUBTRACTED
 from hsnoise.statistics.pixels.clipping import clipped_moments, unclipped
 
 KNOWN = ("exposure_s", "black_level", "white_level", "cfa", "shutter")
@@ -248,3 +251,21 @@ def test_flats_give_the_response_of_each_pixel(rng):
     found = hsnoise.fit(frames, exposure_s=[0.01] * 3, kind=["dark", "flat", "flat"], shutter="global", pixels="differ")
     value, error, _ = found.table["photo_response_nonuniformity.sigma"]
     assert value == pytest.approx(0.01, rel=0.05) and error < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("pedestal_dn", "error_dn", "there"),
+    [
+        # A camera that subtracts 0.5 DN/s; one exposure that lies off says nothing about the others.
+        ([0.0, -0.5, -1.0, -2.0], [0.05] * 4, True),
+        ([0.0, 0.0, -0.5, 0.0], [0.005, 0.005, 0.2, 0.005], False),
+        ([0.0, -0.5, 0.5, -0.4], [0.05] * 4, False),
+    ],
+)
+def test_a_dark_signal_is_subtracted_where_pedestals_fall_on_a_line(pedestal_dn, error_dn, there):
+    classes = types.SimpleNamespace(exposure_s=np.array([0.0, 1.0, 2.0, 4.0]))
+    numbers = {"pedestal_dn": np.array(pedestal_dn), "pedestal_error_dn": np.array(error_dn)}
+    moved = types.SimpleNamespace(classes=classes, moved=np.array([False, True, True, True]), **numbers)
+    rate, error = subtracted(moved, (0.0, 1.0))
+    assert (rate > SUBTRACTED * error) == there
+    assert abs(rate - 0.5 * there) < 4 * error

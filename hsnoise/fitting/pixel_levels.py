@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import UNKNOWN
-from hsnoise.statistics.pixels.classes import slope_over
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.population import Warm
 from hsnoise.statistics.pixels.survey import Plane, Survey
@@ -30,16 +29,22 @@ def growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[f
     if np.ptp(t) == 0:
         mean_error = float(1 / np.sqrt((error**-2.0).sum()))
         return (0.0, UNKNOWN), (float(level.mean()), mean_error if t.max() == 0 else UNKNOWN)
-    design = np.stack([np.ones_like(t), t], 1) / error[:, None]
-    covariance = np.linalg.inv(design.T @ design)
-    theta = covariance @ design.T @ (level / error)
-    left = (level - theta[0] - theta[1] * t) / error
-    covariance = covariance * max(float(left @ left) / max(len(t) - 2, 1), 1.0)
-    slope_error = float(np.sqrt(covariance[1, 1]))
+    slope, slope_error = _line(t, level, error)
     # Pixels differ in growth, so the median does not grow linearly: extrapolate to 0 s from the shortest exposure.
     shortest = int(t.argmin())
-    black = float(level[shortest] - theta[1] * t[shortest])
-    return (float(theta[1]), slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
+    black = float(level[shortest] - slope * t[shortest])
+    return (slope, slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
+
+
+def _line(exposure_s: np.ndarray, level_dn: np.ndarray, error_dn: np.ndarray) -> tuple[float, float]:
+    """Slope of a straight line through levels [exposure], DN/s, and its error, widened by how far they lie off it."""
+    error = np.maximum(error_dn, 1e-6)
+    design = np.stack([np.ones_like(exposure_s), exposure_s], 1) / error[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    theta = covariance @ design.T @ (level_dn / error)
+    left = level_dn / error - design @ theta
+    covariance = covariance * max(float(left @ left) / max(len(left) - 2, 1), 1.0)
+    return float(theta[1]), float(np.sqrt(covariance[1, 1]))
 
 
 def _level(plane: Plane) -> float:
@@ -75,5 +80,5 @@ def subtracted(transfer: Transfer | None, growth: tuple[float, float]) -> tuple[
     """
     if transfer is None or not transfer.moved.any():
         return (-growth[0], growth[1]) if growth[0] < -FALLS * growth[1] else (0.0, np.inf)
-    slopes = slope_over(transfer.classes.exposure_s, np.eye(len(transfer.pedestal_dn)))
-    return float(-slopes @ transfer.pedestal_dn), float(np.sqrt(slopes**2 @ transfer.pedestal_error_dn**2))
+    slope, error = _line(transfer.classes.exposure_s, transfer.pedestal_dn, transfer.pedestal_error_dn)
+    return -slope, error
