@@ -20,7 +20,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.statistics.decomposition import COMPONENTS, STATIC, Component, decomposed, mean_of
 
-DRAWS = 2  # of each model
+DRAWS = 4  # of each model
 CLEAR = 2.0  # standard errors, below which a difference is chance
 IN_WORDS = {
     "frame": "offsets of frames",
@@ -139,6 +139,9 @@ def _shares(
         of_draws = float(np.mean([_error(name, drawn[name], same_pixels) for drawn in closed]))
         # The error of what came out low by chance is too small, that of the model too large if it draws too much.
         error = np.hypot(max(own, np.sqrt(own * of_draws)), of_draws / np.sqrt(DRAWS))
+        # A band whose phase is random in each frame scatters as a whole, not line by line.
+        scatter = np.std([drawn[name].variance_dn2 for drawn in closed], ddof=1) * np.sqrt(1 + 1 / DRAWS)
+        error = max(error, scatter)
         whole, by_names = (_mean(name, of) for of in (closed, named))
         yield Share(exposure_s, channel, name, one.variance_dn2, float(error), whole, by_names, max(total, 1e-300))
 

@@ -60,6 +60,17 @@ def test_a_missing_effect_shows_in_its_component_at_its_size(effect, component, 
     assert worst.off == f"-{worst.unexplained_dn:.2g}"
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_band_of_random_phases_leaves_no_pattern_beyond_chance(seed):
+    """Its mean over few frames is no pattern of columns, however far the capture's phases and the draws' lie apart."""
+    model = CAMERA.add(fx.PeriodicBanding(20.0, 0.31, axis="column"))
+    stack = hsnoise.sample_dark(seed, 6, (64, 96), model, exposure_s=0.02)
+    frames = hsnoise.FrameStack(np.asarray(stack), [0.02], cfa="RGGB", shutter="global")
+    of = [one for one in shares_of(model, frames, jax.random.key(seed)) if one.component == "column"]
+    assert max(abs(one.measured_dn2 - one.closed_dn2) / one.error_dn2 for one in of) < 4
+    assert largest_unexplained(of) is None
+
+
 def test_noise_that_is_not_there_is_too_much():
     found = hsnoise.compare(CAMERA.add(fx.FrameOffset(4.0)), capture(CAMERA, frames=24), draws=16)
     assert found.largest_unexplained.component == "frame" and "the model adds" in found.unexplained
