@@ -38,7 +38,7 @@ from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
-from hsnoise.enhance.training.protocol import middle_of
+from hsnoise.enhance.training.protocol import PROTOCOL, middle_of
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import load_network, save_network
@@ -169,7 +169,7 @@ def drawn_darks(noise: NoiseModel) -> np.ndarray:
 def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
     """Path of the weights of a network trained with the noise called `name`."""
     camera = levelled(camera, level_of(drawn_darks(noise)))
-    sizes = (options.stride, options.side, options.jitter, camera.sensor)
+    sizes = (options.stride, options.side, options.jitter, camera.sensor, camera.mean_e, PROTOCOL)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
@@ -195,10 +195,10 @@ def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
 
 
 def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Display values and noisy light in units of the camera [frame, row, column, 1]: light and its shot noise on
-    unseen real dark frames.
+    """Display values and noisy light in units of the camera [frame, row, column, 1].
 
-    As many frames as there are dark frames; the seed chooses the place on the sensor.
+    Light that averages E[N_e] over the clip, and its shot noise, on unseen real dark frames. As many frames as there
+    are dark frames; the seed chooses the place on the sensor.
     """
     rng = np.random.default_rng(seed)
     white_e = float(np.exp(rng.uniform(*np.log(camera.mean_e)))) / clip.average

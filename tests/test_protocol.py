@@ -149,6 +149,9 @@ def test_tables_have_errors_over_clips_and_the_paired_lead():
     assert f"| {tables.SCALED}, PSNR / dB | strong | +2.00 ± {error:.2f} |" in ahead
     assert "| a | 12.00 | 17.00 | 18.00 | 11.00 | 16.00 |" in psnr and "| a | 0.120 |" in ssim
     assert "n = 2 |" in frames and f"| strong | 18.50 ± {spread:.2f} /" in frames
+    short = [r for r in records if r["clip"] != "a" or r["frame"] == 0]
+    assert "2 longest clips" in tables.tables(short, str)[-1].title
+    assert "| strong | 20.00 ± 2.50 /" in tables.tables(short, str)[-1].markdown()  # of b and c alone
     # Frames and lights of a clip do not make the error smaller.
     assert tables.standard_error([14, 16, 21]) == pytest.approx(spread) and np.isnan(tables.standard_error([1.0]))
 

@@ -113,7 +113,9 @@ def _most_unit_e(about: dict[str, Any]) -> float | None:
 
     The input of some weights was divided by the white of each clip, `white_e`; of others by one constant, `unit_e`.
     """
-    return about.get("unit_e") or max(about.get("white_e", (None,)))
+    if "unit_e" in about:
+        return about["unit_e"]
+    return max(about["white_e"]) if "white_e" in about else None
 
 
 def _light_in_words(about: dict[str, Any]) -> str:
@@ -146,7 +148,7 @@ def _of_counts(args: argparse.Namespace, camera: NoiseModel, unit_e: float | Non
     if stack.n_exposures > 1:  # they are sorted by exposure, not by time
         raise ValueError(f"IN: expected frames of one exposure, got {', '.join(f'{t:g}' for t in stack.exposure_s)} s")
     camera = _as_taken(args, camera, stack)
-    white_e = None if unit_e is None else unit_e / args.brighten
+    white_e = None
     for frame in stack.frames(0):
         electrons = np.asarray(electrons_of(frame, camera))
         if white_e is None:
@@ -155,7 +157,7 @@ def _of_counts(args: argparse.Namespace, camera: NoiseModel, unit_e: float | Non
                     f"IN: the first frame lies {electrons.mean():.3g} e- from black, expected light; is --camera a"
                     f" model of this camera, and is its exposure {camera.exposure_s:g} s?"
                 )
-            white_e = float(electrons.mean()) / (GREY * args.brighten)
+            white_e = (float(electrons.mean()) / GREY if unit_e is None else unit_e) / args.brighten
         yield electrons / white_e
 
 

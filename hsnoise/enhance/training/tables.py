@@ -51,9 +51,8 @@ def in_figures(of: dict[str, float], form: str) -> str:
 
 
 def both(records: Sequence[dict], **chosen) -> str:
-    """PSNR and SSIM, each with its standard error over clips; empty without such frames."""
-    found = {what: of_clips(records, what, **chosen) for what in FORMS}
-    return " / ".join(in_figures(of, FORMS[what]) for what, of in found.items() if of)
+    """PSNR and SSIM, each with its standard error over clips."""
+    return " / ".join(in_figures(of_clips(records, what, **chosen), form) for what, form in FORMS.items())
 
 
 def best_rival(records: Sequence[dict], what: str) -> str:
@@ -67,6 +66,13 @@ def lead(records: Sequence[dict], method: str, what: str, **chosen) -> dict[str,
     of = of_clips(records, what, method=method, **chosen)
     other = of_clips(records, what, method=best_rival(records, what), **chosen)
     return {clip: of[clip] - other[clip] for clip in of}
+
+
+def of_longest(records: Sequence[dict]) -> list[dict]:
+    """Records of the clips with the most frames: with others, means would change where a clip ends."""
+    last = max(record["frame"] for record in records)
+    clips = {record["clip"] for record in records if record["frame"] == last}
+    return [record for record in records if record["clip"] in clips]
 
 
 def tables(records: Sequence[dict], in_words: InWords) -> list[Sheet]:
@@ -113,10 +119,11 @@ def _of_clips(records: Sequence[dict]) -> list[Sheet]:
 
 
 def _of_frames(records: Sequence[dict]) -> Sheet:
-    last = max(record["frame"] for record in records)
-    shown = [n for n in SHOWN_FRAMES if n <= last + 1]
-    rows = [(m, *(both(records, method=m, frame=n - 1) for n in shown)) for m in methods_in(records)]
-    return Sheet("PSNR / dB and SSIM of the nth frame", ("method", *(f"n = {n}" for n in shown)), rows)
+    kept = of_longest(records)
+    shown = [n for n in SHOWN_FRAMES if n <= max(record["frame"] for record in kept) + 1]
+    rows = [(m, *(both(kept, method=m, frame=n - 1) for n in shown)) for m in methods_in(kept)]
+    title = f"PSNR / dB and SSIM of the nth frame, {len({record['clip'] for record in kept})} longest clips"
+    return Sheet(title, ("method", *(f"n = {n}" for n in shown)), rows)
 
 
 def memory_sheet(filling: dict[str, list[float]]) -> Sheet:
@@ -140,13 +147,14 @@ def draw_curves(records: Sequence[dict], filling: dict[str, list[float]], in_wor
     """PSNR against illuminance and frame number (all methods), and while the network's memory fills."""
     figure = Figure(figsize=(14, 4.4), layout="constrained")
     against_light, against_frame, memory = figure.subplots(1, 3)
-    lights, frames = lights_in(records), sorted({record["frame"] for record in records})
+    lights, longest = lights_in(records), of_longest(records)
+    frames = sorted({record["frame"] for record in longest})
     for method, marker in zip(methods_in(records), "so*vDXP", strict=False):
         style = {"label": method, "alpha": 0.8, "lw": 2.5 if method in (OURS, SCALED) else 1.2}
         of = [list(of_clips(records, "psnr_db", method=method, mean_e=light).values()) for light in lights]
         errors = [standard_error(values) for values in of]
         against_light.errorbar(lights, [np.mean(values) for values in of], errors, fmt=f"{marker}-", capsize=3, **style)
-        of = [list(of_clips(records, "psnr_db", method=method, frame=frame).values()) for frame in frames]
+        of = [list(of_clips(longest, "psnr_db", method=method, frame=frame).values()) for frame in frames]
         against_frame.plot([n + 1 for n in frames], [np.mean(values) for values in of], f"{marker}-", ms=4, **style)
     against_light.set_xscale("log")
     against_light.set_xticks(lights, [in_words(light) for light in lights])
@@ -156,7 +164,11 @@ def draw_curves(records: Sequence[dict], filling: dict[str, list[float]], in_wor
         memory.plot(range(1, len(values) + 1), values, "o-", ms=3, label=clip)
     memory.legend(fontsize=8)
     names = ("light of the scene", "number of the frame", "frames seen, the scored one included")
-    titles = ("Against light, with standard errors", "Against the number of the frame", "While the memory fills")
+    titles = (
+        "Against light, with standard errors",
+        "Against the number of the frame, longest clips",
+        "While the memory fills",
+    )
     for axis, name, title in zip((against_light, against_frame, memory), names, titles, strict=True):
         axis.set_xlabel(name)
         axis.set_ylabel("PSNR (dB)")
