@@ -1,0 +1,232 @@
+"""The published networks: their sizes, a property of each, and that training lowers their loss."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from benchmarks.networks import RIVALS, scaled_to, tables
+from benchmarks.rivals.fastdvdnet import STRIDE
+from benchmarks.rivals.kpn import BURST, KERNEL, filtered
+from benchmarks.rivals.layers import Noise, displayed_with_noise, noise_map_of
+from benchmarks.rivals.toflow import warped
+from hsnoise.chain.photometry import display_from_linear, linear_from_display
+from hsnoise.enhance.training.noisy import camera_of, noisy_of
+
+KEY = jax.random.key(3)
+GREY, COLOUR = Noise((0.05,), (0.01,)), Noise((0.05, 0.03, 0.05), (0.01, 0.01, 0.02))
+# In the papers or their released code, see each module.
+PARAMETERS = {
+    ("FFDNet", 1): 485_316,
+    ("FFDNet", 3): 852_108,
+    ("KPN", 1): 28_703_064,
+    ("TOFlow", 3): 960_200 + 445_123,
+    ("FastDVDnet", 3): 2_477_642,
+}
+
+
+@cache
+def small(name, noise=COLOUR):
+    return RIVALS[name](KEY, noise, width=1 / 8)
+
+
+def scene(frames=8, side=32, channels=3, seed=0):
+    """A picture of blocks that moves by a pixel each frame: clean display values and noisy linear light."""
+    rng = np.random.default_rng(seed)
+    blocks = np.kron(rng.uniform(0.1, 0.9, (16, 16, channels)), np.ones((4, 4, 1)))
+    clean = np.stack([blocks[i : i + side, :side] for i in range(frames)])[:, None].astype(np.float32)
+    light = np.asarray(linear_from_display(clean))
+    noisy = light + rng.normal(0, 0.1, light.shape)
+    return jnp.asarray(noisy, jnp.float32), jnp.asarray(clean)
+
+
+@pytest.mark.parametrize(("name", "channels"), PARAMETERS)
+def test_published_sizes(name, channels):
+    noise = GREY if channels == 1 else COLOUR
+    net = eqx.filter_eval_shape(RIVALS[name], KEY, noise)
+    leaves = jax.tree.leaves(eqx.filter(net, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)))
+    assert sum(math.prod(leaf.shape) for leaf in leaves) == PARAMETERS[name, channels]
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_training_lowers_the_loss_and_odd_frames_keep_their_size(name):
+    net, (noisy, clean) = small(name), scene()
+    optimiser = optax.adam(1e-3)
+
+    @eqx.filter_jit
+    def step(net, memory):
+        value, slope = eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, jnp.float32(0.5)))(net)
+        change, memory = optimiser.update(slope, memory)
+        return eqx.apply_updates(net, change), memory, value, slope
+
+    memory, values = optimiser.init(eqx.filter(net, eqx.is_array)), []
+    for _ in range(6):
+        net, memory, value, slope = step(net, memory)
+        values.append(float(value))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    assert values[-1] < 0.95 * values[0]
+    shape = (3, 2, 9, 11, 3)
+    assert jax.eval_shape(net.whole_video, jax.ShapeDtypeStruct(shape, jnp.float32)).shape == shape
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_frames_beyond_the_window_do_not_matter_and_those_within_do(name):
+    net, noisy = small(name), scene(frames=12)[0][:, :, :16, :16]
+    video = eqx.filter_jit(net.whole_video)
+    at = 5
+    one = np.asarray(video(noisy))[at]
+    assert np.abs(np.asarray(net.video(noisy))[at - net.before] - one).max() < 1e-4
+    for place, matters in ((at - net.before - 1, False), (at - net.before, True), (at + net.after + 1, False)):
+        other = np.asarray(video(noisy.at[place].add(0.3)))[at]
+        assert (np.abs(other - one).max() > 1e-6) == matters
+
+
+def test_noise_map_is_the_noise_of_drawn_frames():
+    camera = camera_of("grasshopper3", None, (20.0, 20.0))
+    light = jnp.full((8, 48, 48, 3), 0.5, jnp.float32)
+    unit_e = 40.0
+    noisy = noisy_of(KEY, light, camera.model, camera.model, 20.0) * (20.0 / unit_e)
+    expected = np.sqrt(0.5 * np.mean(np.diff(np.asarray(noisy, float), axis=0) ** 2, (0, 1, 2)))
+    found = noise_map_of(camera, unit_e).sigma(jnp.full((1, 1, 3), 0.25, jnp.float32))[0, 0]
+    # The row gain, which the map leaves out, adds a few per cent.
+    np.testing.assert_allclose(found, expected, rtol=0.06)
+
+
+def test_noise_of_display_values_follows_the_curve():
+    noise = Noise((0.0,), (1e-6,))
+    light = jnp.asarray([-0.01, 0.002, 0.1, 0.5], jnp.float32).reshape(1, 4, 1)
+    slope = jax.vmap(jax.grad(lambda x: display_from_linear(x)))(light.reshape(-1))
+    np.testing.assert_allclose(displayed_with_noise(light, noise)[1].reshape(-1), 1e-3 * slope, rtol=0.01)
+
+
+def test_ffdnet_smooths_more_where_the_map_says_more_noise():
+    """Trained on noise of many strengths, it follows the map: the property that gives the network its name."""
+    net, optimiser = small("FFDNet", GREY), optax.adam(3e-3)
+
+    def drawn(key):
+        keys = jax.random.split(key, 3)
+        sigma = jax.random.uniform(keys[0], (16, 1, 1, 1), jnp.float32, 0, 0.5)
+        clean = 0.5 + jnp.zeros((16, 16, 16, 1), jnp.float32)
+        clean = clean + 0.2 * jax.random.normal(keys[1], clean.shape, jnp.float32)
+        return clean, clean + sigma * jax.random.normal(keys[2], clean.shape, jnp.float32), sigma + 0 * clean
+
+    @eqx.filter_jit
+    def step(net, memory, key):
+        clean, noisy, sigma = drawn(key)
+        slope = eqx.filter_grad(lambda net: jnp.mean((net.denoised(noisy, sigma) - clean) ** 2))(net)
+        change, memory = optimiser.update(slope, memory)
+        return eqx.apply_updates(net, change), memory
+
+    memory = optimiser.init(eqx.filter(net, eqx.is_array))
+    for key in jax.random.split(KEY, 150):
+        net, memory = step(net, memory, key)
+    _, noisy, sigma = drawn(jax.random.key(9))
+    spread = [float(jnp.std(net.denoised(noisy, 0 * sigma + level))) for level in (0.02, 0.2, 0.5)]
+    assert spread[0] > 1.2 * spread[1] > 1.2 * 1.2 * spread[2]
+
+
+def test_kernels_that_are_one_pixel_give_that_pixel_of_that_frame():
+    bursts = scene(BURST, 12)[0]
+    kernels = np.zeros((1, 12, 12, BURST, KERNEL**2), np.float32)
+    middle = KERNEL**2 // 2
+    kernels[..., 2, middle] = 1
+    kernels[..., 5, middle + 1] = 1
+    out = np.asarray(filtered(bursts, jnp.asarray(kernels)))
+    np.testing.assert_array_equal(out[2], bursts[2])
+    np.testing.assert_array_equal(out[5, :, :, :-1], bursts[5, :, :, 1:])
+    assert not out[[0, 1, 3, 4, 6, 7]].any()
+
+
+def test_untrained_kpn_is_near_the_mean_of_its_burst():
+    net = small("KPN")
+    still = jnp.full((BURST, 1, 32, 32, 3), 0.3, jnp.float32)
+    kernels = eqx.filter_jit(net.predicted)(still)
+    bias = net.kernels[-1].bias
+    np.testing.assert_allclose(bias.reshape(BURST, -1).sum(-1), 1, rtol=1e-6)
+    assert kernels.shape == (1, 32, 32, BURST, KERNEL**2)
+
+
+def test_warping_by_the_true_flow_registers_a_shifted_picture():
+    picture = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (1, 20, 24, 2)), jnp.float32)
+    shifted = jnp.roll(picture, (2, -3), (1, 2))
+    flow = jnp.broadcast_to(jnp.asarray([2.0, -3.0], jnp.float32).reshape(1, 1, 1, 2), (1, 20, 24, 2))
+    inside = (slice(None), slice(0, 18), slice(3, 24))
+    np.testing.assert_array_equal(warped(shifted, flow)[inside], picture[inside])
+    half = warped(picture, flow * 0 + 0.5)[:, :-1, :-1]
+    mean = sum(picture[:, r : r + 19, c : c + 23] for r in (0, 1) for c in (0, 1)) / 4
+    np.testing.assert_allclose(half, mean, atol=1e-6)
+    one_row = warped(picture[:, :1], flow[:, :1])
+    np.testing.assert_array_equal(one_row[:, :, 3:], picture[:, :1, :-3])
+
+
+def test_flow_is_learned_from_a_shift_through_the_warping():
+    """The flow network, trained by the warped picture alone, finds the motion: task-oriented flow."""
+    ramp = jnp.arange(16, dtype=jnp.float32)[None, :, None, None] / 16
+    middle = jnp.broadcast_to(ramp, (1, 16, 16, 3))
+    other = middle + 2 / 16  # the same ramp, two rows further
+    net, optimiser = small("TOFlow"), optax.adam(2e-3)
+    inside = (slice(None), slice(3, 12))
+
+    def error(net):
+        return jnp.mean((warped(other, net.flow(middle, other)) - middle)[inside] ** 2)
+
+    @eqx.filter_jit
+    def step(net, memory):
+        change, memory = optimiser.update(eqx.filter_grad(error)(net), memory)
+        return eqx.apply_updates(net, change), memory
+
+    memory = optimiser.init(eqx.filter(net, eqx.is_array))
+    np.testing.assert_array_equal(net.flow(middle, other), 0)
+    for _ in range(60):
+        net, memory = step(net, memory)
+    assert abs(float(jnp.median(net.flow(middle, other)[inside][..., 0])) + 2) < 0.5
+
+
+def test_fastdvdnet_moves_with_its_input_by_whole_strides():
+    block = small("FastDVDnet").stages[0]
+    frames = list(jax.random.uniform(KEY, (3, 1, 96, 96, 3), jnp.float32))
+    sigmas = [0.1 + 0 * frame[..., :1] for frame in frames]
+    run = eqx.filter_jit(block)
+    inside = slice(40, 56)  # beyond the reach of the zeros outside
+    still = np.asarray(run(frames, sigmas))[:, inside, inside]
+    for shift, same in ((STRIDE, True), (STRIDE // 2, False)):
+        moved = np.asarray(run([jnp.roll(frame, shift, 1) for frame in frames], sigmas))
+        assert np.allclose(moved[:, 40 + shift : 56 + shift, inside], still, atol=1e-4) == same
+
+
+def test_fastdvdnet_shares_triples_as_separate_windows_would():
+    net, (noisy, _) = small("FastDVDnet"), scene(frames=7, side=16)
+    whole = np.asarray(eqx.filter_jit(net.video)(noisy))
+    window = eqx.filter_jit(net.video)
+    assert len(whole) == 3
+    for i in range(3):
+        np.testing.assert_allclose(window(noisy[i : i + 5])[0], whole[i], atol=1e-4)
+
+
+def test_scaling_undoes_a_change_of_brightness():
+    clean = np.asarray(scene()[1][:, 0])
+    dim = np.asarray(display_from_linear(0.3 * np.asarray(linear_from_display(clean))))
+    assert np.abs(dim - clean).max() > 0.2
+    np.testing.assert_allclose(scaled_to(dim, clean), clean, atol=1e-4)
+
+
+def test_differences_are_paired_over_clips():
+    def result(values):
+        clips = {name: dict.fromkeys(("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled"), v) for name, v in values}
+        return {"parameters": 1, "steps": 2, "minutes": 1.0, "rate": 0.1, "clips": clips}
+
+    own, apart = tables({"ST-LSTM": result([("a", 20.0), ("b", 30.0)]), "KPN": result([("a", 18.0), ("b", 28.0)])})
+    assert own.rows[0][5] == "25.00 +- 5.00"
+    assert apart.rows == [("ST-LSTM - KPN", "+2.00 +- 0.00", "+2.000 +- 0.000", "+2.00 +- 0.00", "+2.000 +- 0.000")]
+
+
+def test_width_must_be_positive():
+    with pytest.raises(ValueError, match="width: expected a number above 0, got 0"):
+        RIVALS["KPN"](KEY, GREY, width=0)
