@@ -32,19 +32,20 @@ import hsnoise
 from hsnoise import NoiseModel
 from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
-from hsnoise.chain.photometry import GREY, display_from_linear, light_of_frames
+from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
+from hsnoise.enhance.training.protocol import middle_of
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import load_network, save_network
 from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
-DIM, BRIGHT = 2.0, 8.0  # photoelectrons of white, in standard deviations of a dark frame
+DIM, BRIGHT = 0.4, 1.6  # photoelectrons of the average, in standard deviations of a dark frame
 BATCH, FRAMES, CROP = 4, 8, 128
 OUTSIDE, NEAR = 6.0, 3.0  # standard deviations
 MATCH_SIDE = 256
@@ -131,7 +132,7 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
         print(fit)
         params = at_exposure(fit.params, sensor.exposure_s)
         sigma = sensor.dark_sigma_e(params)
-        light_e = GREY * float(np.sqrt(DIM * BRIGHT)) * sigma
+        light_e = middle_of((DIM, BRIGHT)) * sigma
         for name in ("gaussian", "poisson-gaussian"):
             matched(params, name, light_e, sigma**2).save(paths[name])
         params.save(paths["paper"])  # written last: it shows that all three exist
@@ -194,12 +195,13 @@ def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
 
 
 def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Display values and noisy light [frame, row, column, 1]: light and its shot noise on unseen real dark frames.
+    """Display values and noisy light in units of the camera [frame, row, column, 1]: light and its shot noise on
+    unseen real dark frames.
 
     As many frames as there are dark frames; the seed chooses the place on the sensor.
     """
     rng = np.random.default_rng(seed)
-    white_e = float(np.exp(rng.uniform(*np.log(camera.white_e))))
+    white_e = float(np.exp(rng.uniform(*np.log(camera.mean_e)))) / clip.average
     n = min(len(sensor.unseen), len(clip.frames))
     side = min(CROP, *sensor.unseen.shape[1:], *clip.frames.shape[1:3])
     row, column = ((size - side) // 2 for size in clip.frames.shape[1:3])
@@ -208,7 +210,7 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
     dark = sensor.unseen[rng.permutation(len(sensor.unseen))[:n], row : row + side, column : column + side]
     gain = float(np.mean(np.asarray(camera.model["gain"].value)))
     counts = np.rint(dark + gain * rng.poisson(light[..., 0] * white_e))
-    noisy = np.asarray(electrons_of(counts, camera.model)) / white_e
+    noisy = np.asarray(electrons_of(counts, camera.model)) / camera.unit_e
     return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
 
 

@@ -28,7 +28,9 @@ from rich.console import Console
 from rich.table import Table
 
 import hsnoise
+from hsnoise.chain.photometry import GREY
 from hsnoise.effects import ADC
+from hsnoise.enhance.training.clips import Batch
 from hsnoise.enhance.training.noisy import camera_of
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.steps import Trainer, examples
@@ -272,8 +274,9 @@ def training(rounds: int) -> list[Line]:
     camera = camera_of("canon_5d3", None, None)
     trainer = Trainer(Recipe(maps=16, decay=False), 1, camera, camera.model)
     state = trainer.start(0)
-    batch = np.random.default_rng(0).integers(0, 256, (4, 8, 32, 32, 3), np.uint8)
-    light, draw = jnp.asarray(camera.white_e, jnp.float32), eqx.filter_jit(examples)
+    frames = np.random.default_rng(0).integers(0, 256, (4, 8, 32, 32, 3), np.uint8)
+    batch = Batch(frames, np.full(4, GREY, np.float32))
+    light, draw = jnp.asarray(camera.mean_e, jnp.float32), eqx.filter_jit(examples)
 
     def drawn() -> tuple[jax.Array, jax.Array]:
         return draw(batch, jax.random.key(0), trainer.camera.model, trainer.noise, light)

@@ -110,6 +110,18 @@ def test_brighten_acts_before_the_network(place, seen, more):
     assert not more or means[0] == pytest.approx(0.2, rel=1e-5)
 
 
+def test_raw_frames_are_divided_by_the_unit_of_the_weights(place, seen):
+    camera = hsnoise.cameras.grasshopper3(black_level_dn=64)
+    counts = hsnoise.sample(jax.random.key(0), mosaic(np.full((2, 48, 64, 3), 30.0, np.float32), "RGGB"), camera)
+    np.savez(place / "lit.npz", counts=np.asarray(counts)[None], exposure_s=[0.03])
+    camera.save(place / "lit.json")
+    about = {"camera": "grasshopper3", "mean_e": [20.0, 45.0], "unit_e": 150.0}
+    save_network(place / "unit.eqx", STLSTM(jax.random.key(0), maps=2, kernels=(3,)), about)
+    arguments = ["--weights", str(place / "unit.eqx"), "--camera", str(place / "lit.json"), "--brighten", "2"]
+    assert main(["enhance", str(place / "lit.npz"), str(place / "lit.mp4"), *arguments]) == 0
+    assert np.mean(seen[0]) == pytest.approx(2 * 30 / 150, rel=0.03)
+
+
 def test_nothing_is_left_of_a_run_that_is_terminated(place, monkeypatch):
     def ended(net, light, tile):
         yield next(light)

@@ -22,7 +22,9 @@ from hsnoise.enhance.training import checkpoints, evaluate, train
 from hsnoise.enhance.training.clips import Clip, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, camera_of
 from hsnoise.enhance.training.presets import Preset, Recipe
+from hsnoise.enhance.training.protocol import scaled_to
 from hsnoise.enhance.training.rivals import denoised, rivals, tuned
+from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.steps import Trainer, batch_rng
 from hsnoise.enhance.weights import load_network, save_network
 
@@ -113,7 +115,7 @@ def test_another_model_of_the_same_name_is_another_run(folder, tmp_path, capsys)
     path = tmp_path / "model.json"
     for black_level_dn in (0, 64):
         hsnoise.cameras.canon_5d3(black_level_dn=black_level_dn).save(path)
-        run = arguments(folder, tmp_path / "run", "--camera", str(path), "--white-e", "2,10")
+        run = arguments(folder, tmp_path / "run", "--camera", str(path), "--mean-e", "2,10")
         if black_level_dn == 0:
             run_train(run)
     with pytest.raises(SystemExit):
@@ -219,9 +221,9 @@ def test_damaged_checkpoints_do_not_push_out_good_ones(tmp_path):
         (["--noise", "salt"], "--noise: expected"),
         (["--lux", "0"], "--lux: expected low,high"),
         (["--lux", "nan"], "--lux: expected low,high"),
-        (["--lux", "0.1", "--white-e", "3,4"], "both say how much light"),
-        (["--white-e", "1,inf"], "--white-e: expected low,high"),
-        (["--white-e", "4,3"], "--white-e: expected low,high"),
+        (["--lux", "0.1", "--mean-e", "3,4"], "both say how much light"),
+        (["--mean-e", "1,inf"], "--mean-e: expected low,high"),
+        (["--mean-e", "4,3"], "--mean-e: expected low,high"),
         (["--exposure", "0.1"], "--exposure: goes with a model.json"),
         (["--steps", "0"], "--steps: expected at least 1"),
         (["--seed", "-1"], "--seed: expected 0 to"),
@@ -242,7 +244,7 @@ def test_the_same_step_is_the_same_whatever_came_before(folder):
     clips, _ = held_out(read_clips(folder))
     trainer = Trainer(TINY.recipe, 6, camera, camera.model)
     batch = crops(clips, batch_rng(3, 5), 2, 3, 8)
-    np.testing.assert_array_equal(batch, crops(clips, batch_rng(3, 5), 2, 3, 8))
+    np.testing.assert_array_equal(batch.frames, crops(clips, batch_rng(3, 5), 2, 3, 8).frames)
     (one, _), first = trainer.step(trainer.start(3), batch, 3, 5)
     (other, _), second = trainer.step(trainer.start(3), batch, 3, 5)
     assert float(first) == float(second)
@@ -260,14 +262,19 @@ def test_rivals_that_are_not_installed_are_named_with_their_extra(monkeypatch, c
 def test_rivals_make_noisy_frames_better():
     rng = np.random.default_rng(0)
     clean = np.asarray(display_from_linear(np.full((3, 32, 32, 3), 0.3)))
-    noisy = (0.3 + 0.1 * rng.standard_normal((3, 32, 32, 3))).astype(np.float32)
-    before = np.mean((np.asarray(display_from_linear(noisy)) - clean) ** 2)
+    camera = camera_of("canon_5d3", None, (20.0, 20.0))
+    noisy = ((rng.poisson(30.0, clean.shape) + 3.5 * rng.standard_normal(clean.shape)) / camera.unit_e).astype(
+        np.float32
+    )
+    scene = Scene("even", camera, 30.0, 100.0, clean, noisy)
+
+    def error_of(found):
+        return np.mean((scaled_to(found, clean) - clean) ** 2)
+
     for name, denoise in rivals().items():
-        if name.startswith("BM"):
-            continue
-        choice = tuned(denoise, noisy, clean, 0.1)
-        after = np.mean((denoised(denoise, noisy, 0.1, *choice) - clean) ** 2)
-        assert after < 0.2 * before, name
+        if not name.startswith("BM"):
+            choice = tuned(denoise, scene)
+            assert error_of(denoised(denoise, scene, *choice)) < 0.2 * error_of(display_from_linear(noisy)), name
 
 
 @pytest.mark.slow
@@ -277,7 +284,7 @@ def test_an_evaluation_is_written(folder, whole, tmp_path, capsys):
     text = (tmp_path / "found" / "evaluation.md").read_text()
     assert "scaled input" in text and "hsnoise ST-LSTM" in text and "| d |" in text
     assert "canon_5d3, 0.05 lux to 0.2 lux" in text
-    assert len((tmp_path / "found" / "frames.csv").read_text().splitlines()) == 1 + 2 * 3 * 4  # methods, levels, frames
+    assert len((tmp_path / "found" / "frames.csv").read_text().splitlines()) == 1 + 3 * 3 * 4  # methods, levels, frames
     assert (tmp_path / "found" / "curves.png").exists() and (tmp_path / "found" / "frames-d.png").exists()
     with pytest.raises(SystemExit):
         run_evaluate([str(weights.with_name("run.json")), "--clips", str(folder)])
@@ -302,7 +309,7 @@ def test_weights_are_judged_with_the_camera_and_light_of_their_training(folder, 
     other.parent.mkdir()
     hsnoise.cameras.canon_5d3(black_level_dn=64).save(model)
     hsnoise.cameras.canon_5d3(black_level_dn=128).save(other)
-    run_train(arguments(folder, tmp_path / "run", "--camera", str(model), "--white-e", "2,10"))
+    run_train(arguments(folder, tmp_path / "run", "--camera", str(model), "--mean-e", "2,10"))
     judge = [str(tmp_path / "run" / train.ENDED), "--clips", str(folder), "--crop", "8", "--no-rivals"]
     judge += ["--out", str(tmp_path / "found")]
     with pytest.raises(SystemExit):
@@ -315,14 +322,14 @@ def test_weights_are_judged_with_the_camera_and_light_of_their_training(folder, 
     assert "another camera" in capsys.readouterr().out
 
 
-def mono_camera(white_e=(20.0, 20.0)):
+def mono_camera(mean_e=(20.0, 20.0)):
     model = hsnoise.NoiseModel(
         [ShotNoise(), ReadNoise(2.0), Gain(0.5), BlackLevel(10.0), ADC(4095)],
         cfa="mono",
         shutter="global",
         exposure_s=0.1,
     )
-    return Camera("sensor", model, white_e)
+    return Camera("sensor", model, mean_e)
 
 
 @pytest.mark.slow
@@ -333,9 +340,8 @@ def test_light_is_added_to_real_dark_frames():
     clip = Clip("even", np.full((9, 36, 36, 3), 188, np.uint8))
     clean, noisy = noise_ablation.real_scene(sensor, clip, camera, 3)
     assert clean.shape == noisy.shape == (6, 36, 36, 1)  # as many frames as there are dark ones
-    assert noisy.mean() == pytest.approx(0.503, abs=0.02)
-    electrons = 20 * 0.503
-    assert noisy.std() * 20 == pytest.approx(np.sqrt(electrons + 4 + (1 / 12 / 0.25) * 2), rel=0.05)
+    assert camera.unit_e == pytest.approx(100) and noisy.mean() * 100 == pytest.approx(20, rel=0.02)
+    assert noisy.std() * 100 == pytest.approx(np.sqrt(20 + 4 + (1 / 12 / 0.25) * 2), rel=0.05)
 
 
 def test_the_level_of_darks_is_taken_off_whatever_the_fit_says(rng):

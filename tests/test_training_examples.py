@@ -15,16 +15,17 @@ import hsnoise
 from hsnoise._core.types import cfa_tile
 from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise, TapOffsets
 from hsnoise.enhance.training import evaluate
-from hsnoise.enhance.training.clips import Clip, crops, held_out, moving_stills, read_clips
-from hsnoise.enhance.training.noisy import OPTICS, camera_of, jittered, matched, noise_of
+from hsnoise.enhance.training.clips import Batch, Clip, crops, held_out, moving_stills, read_clips
+from hsnoise.enhance.training.noisy import camera_of, jittered, matched, noise_of
+from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.steps import batch_rng, examples
 from hsnoise.enhance.training.validation import Validation
 from hsnoise.enhance.training.vgg import LAYERS, features_of, name_of, read_weights
 
 
 def test_a_short_clip_is_played_forth_and_back():
-    frames = np.broadcast_to(np.arange(4, dtype=np.uint8)[:, None, None, None], (4, 8, 8, 3))
-    batch = crops([Clip("short", frames)], batch_rng(0, 0), 64, 7, 8)[:, :, 0, 0, 0].astype(int)
+    frames = np.broadcast_to(np.arange(4, dtype=np.uint8)[:, None, None, None], (4, 8, 8, 3)).copy()
+    batch = crops([Clip("short", frames)], batch_rng(0, 0), 64, 7, 8).frames[:, :, 0, 0, 0].astype(int)
     assert set(np.unique(np.abs(np.diff(batch)))) == {1}  # no jump, no frame twice
     assert {0, 3} == set(batch.min(1)) | set(batch.max(1)) and len(np.unique(batch[:, 0])) == 4
 
@@ -38,22 +39,24 @@ def test_validation_takes_clips_of_different_lengths(tmp_path):
 
 
 @pytest.mark.slow
-def test_examples_have_the_light_of_the_clip_as_their_mean():
+def test_examples_have_the_light_of_their_clip_in_units_of_the_camera():
     camera = camera_of("grasshopper3", None, (30.0, 30.0))
     model = camera.model.with_value("black_level", "value", 200.0)
-    batch = np.full((2, 4, 24, 24, 3), 188, np.uint8)  # half of white in linear light
-    clean, noisy = examples(batch, jax.random.key(0), model, model, np.float32([30, 30]))
-    assert clean.shape == noisy.shape == batch.shape
+    frames = np.full((2, 4, 24, 24, 3), 188, np.uint8)  # half of white in linear light
+    # Pieces of clips that average as much as the piece, and twice as much.
+    batch = Batch(frames, np.float32([0.503, 1.006]))
+    clean, noisy = examples(batch, jax.random.key(0), model, model, np.float32([30, 30]), 0.0)
+    assert clean.shape == noisy.shape == frames.shape
     np.testing.assert_allclose(clean, 188 / 255, atol=1e-5)
-    # Cameras are 10 % off, which the conversion does not know.
-    assert float(noisy.mean()) == pytest.approx(0.503, rel=0.15)
+    assert camera.unit_e == pytest.approx(150)
+    np.testing.assert_allclose(noisy.mean((1, 2, 3, 4)), [30 / 150, 15 / 150], rtol=0.03)
 
 
 def test_pieces_lie_anywhere_on_the_sensor():
     """Taps of 16 columns: a piece of 24 colour pixels has at most three of them, not eight."""
     effects = [Gain(1.0), TapOffsets(1000.0, taps=8), BlackLevel(0.0)]
     model = hsnoise.NoiseModel(effects, cfa="mono", shutter="global", exposure_s=0.1)
-    batch = np.zeros((16, 1, 24, 24, 3), np.uint8)
+    batch = Batch(np.zeros((16, 1, 24, 24, 3), np.uint8), np.ones(16, np.float32))
     light = np.float32([1, 1])
     _, noisy = examples(batch, jax.random.key(0), model, model, light, 0.0, (64, 128))
     rows = np.asarray(noisy)[:, 0, 0, :, 0]
@@ -81,7 +84,8 @@ def test_held_out_videos_are_held_out_with_their_long_cuts():
 def test_frames_seen_count_whatever_the_frames_show(rng):
     """A network that takes the mean of the frames so far: white noise of 0.1 falls with their root."""
     clean = np.broadcast_to(np.linspace(0.3, 0.7, 7)[:, None, None, None], (7, 40, 40, 1))
-    scene = evaluate.Scene("ramp", 10.0, clean, clean + 0.1 * rng.standard_normal(clean.shape))
+    noisy = clean + 0.1 * rng.standard_normal(clean.shape)
+    scene = Scene("ramp", camera_of("canon_5d3", None, None), 10.0, 20.0, clean, noisy)
 
     def net(noisy):  # less what it knows of the ramp, so that only its noise is left
         seen = np.arange(1, len(noisy) + 1).reshape(-1, 1, 1, 1, 1)
@@ -89,7 +93,9 @@ def test_frames_seen_count_whatever_the_frames_show(rng):
         return np.cumsum(noisy, 0) / seen + ramp
 
     found = evaluate.while_memory_fills(net, scene)
-    np.testing.assert_allclose(found, 20 + 10 * np.log10(np.arange(1, 5)), atol=0.3)
+    assert list(found) == ["ramp", "ramp, scaled"]
+    for values in found.values():
+        np.testing.assert_allclose(values, 20 + 10 * np.log10(np.arange(1, 5)), atol=0.3)
 
 
 def test_folders_of_images_are_named_whole_and_hidden_files_are_left_out(tmp_path):
@@ -156,17 +162,12 @@ def test_simpler_noise_has_the_mean_of_clamped_darks(kind):
     assert means[1] == pytest.approx(means[0], abs=0.5)
 
 
-def test_light_of_the_paper():
-    # 0.1 lux on white at f/5.6: 400 electrons that the lens passes 1 in 125 of.
-    assert float(OPTICS["canon_5d3"].white_e(0.1)) == pytest.approx(3.1, rel=0.05)
-
-
 def test_noise_of_another_sensor_is_refused(tmp_path):
     path = tmp_path / "mono.json"
     hsnoise.NoiseModel([ReadNoise(2.0), Gain(1.0)], cfa="mono", shutter="global", exposure_s=0.1).save(path)
     with pytest.raises(ValueError, match="cfa mono"):
         noise_of(str(path), camera_of("canon_5d3", None, None))
-    with pytest.raises(ValueError, match="--white-e: needed"):
+    with pytest.raises(ValueError, match="--mean-e: needed"):
         camera_of(str(path), None, None)
 
 

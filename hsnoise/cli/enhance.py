@@ -37,14 +37,13 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     _check(args)
     net, about = load_network(args.weights or SHIPPED)
     if args.weights is None:
-        low, high = about["white_e"]
         print(
-            f"Using the weights that come with hsnoise, trained for {about['camera']}, white of {low:.2g} to {high:.2g}"
-            " photoelectrons; choose others by --weights",
+            f"Using the weights that come with hsnoise, trained for {about['camera']}, {_light_in_words(about)};"
+            " choose others by --weights",
             file=sys.stderr,
         )
     _check_network(args, net, about, camera)
-    light = _of_display(args, net) if camera is None else _of_counts(args, camera)
+    light = _of_display(args, net) if camera is None else _of_counts(args, camera, about.get("unit_e"))
     console = Console(stderr=True)
     frames = enhance(net, _noted(light, about), tile=args.tile)
     shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
@@ -100,17 +99,30 @@ def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.n
     noise and picture, so they are never less than the noise.
     """
     for number, frame in enumerate(frames):
-        if number == 0 and "white_e" in about and _is_clean(frame, max(about["white_e"])):
+        if number == 0 and (unit_e := _most_unit_e(about)) is not None and _is_clean(frame, unit_e):
             warnings.warn(
-                f"IN: has far less noise than the weights were trained for, white of up to"
-                f" {max(about['white_e']):.3g} photoelectrons; the result may be worse than the input",
+                f"IN: has far less noise than the weights were trained for, {_light_in_words(about)}; the result may be"
+                " worse than the input",
                 stacklevel=2,
             )
         yield frame
 
 
+def _most_unit_e(about: dict[str, Any]) -> float | None:
+    """The most photoelectrons that were 1 in the network's input; None if the weights do not say it.
+
+    The input of some weights was divided by the white of each clip, `white_e`; of others by one constant, `unit_e`.
+    """
+    return about.get("unit_e") or max(about.get("white_e", (None,)))
+
+
+def _light_in_words(about: dict[str, Any]) -> str:
+    of, (low, high) = ("scenes that average", about["mean_e"]) if "mean_e" in about else ("white of", about["white_e"])
+    return f"{of} {low:.2g} to {high:.2g} photoelectrons"
+
+
 def _is_clean(frame: np.ndarray, white_e: float) -> bool:
-    """Whether most blocks of light [row, column, channel] lack the shot noise of a white of `white_e` electrons."""
+    """Whether most blocks of light [row, column, channel] lack the shot noise of a 1 of `white_e` electrons."""
     rows, columns = (n - n % BLOCK for n in frame.shape[:2])
     blocks = frame[:rows, :columns].reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK, -1)
     variance = np.mean(np.diff(blocks, axis=3) ** 2, (1, 3, 4)) / 2
@@ -128,13 +140,13 @@ def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
         raise ValueError(f"{error}; if these are raw frames, give --camera") from error
 
 
-def _of_counts(args: argparse.Namespace, camera: NoiseModel) -> Iterator[np.ndarray]:
-    """Light of raw frames, with white chosen such that the first frame has ordinary brightness."""
+def _of_counts(args: argparse.Namespace, camera: NoiseModel, unit_e: float | None) -> Iterator[np.ndarray]:
+    """Light of raw frames in the network's unit; None: white, chosen such that the first frame is ordinarily bright."""
     stack = load(args.video, cfa=args.cfa, kind="flat", exposure_s=args.exposure)
     if stack.n_exposures > 1:  # they are sorted by exposure, not by time
         raise ValueError(f"IN: expected frames of one exposure, got {', '.join(f'{t:g}' for t in stack.exposure_s)} s")
     camera = _as_taken(args, camera, stack)
-    white_e = None
+    white_e = None if unit_e is None else unit_e / args.brighten
     for frame in stack.frames(0):
         electrons = np.asarray(electrons_of(frame, camera))
         if white_e is None:

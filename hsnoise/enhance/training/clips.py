@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise.chain.photometry import linear_from_display
 from hsnoise.enhance.video import frames_of, is_clip
 
 HELD_OUT_EVERY = 4
@@ -35,6 +38,22 @@ class Clip:
     def is_long(self) -> bool:
         """Whether it is a longer cut of a video."""
         return self.source != self.name
+
+    @cached_property
+    def average(self) -> float:
+        """Average linear light of all frames (1 is white). Raises ValueError for a black clip."""
+        counts = np.bincount(self.frames.reshape(-1), minlength=256)
+        average = float(counts @ np.asarray(linear_from_display(np.arange(256) / 255)) / counts.sum())
+        if not average > 0:
+            raise ValueError(f"clip {self.name}: expected some light, got black frames")
+        return average
+
+
+class Batch(NamedTuple):
+    """Pieces of clips: frames [example, frame, row, column, 3] of uint8, and the average light of each one's clip."""
+
+    frames: np.ndarray
+    average: np.ndarray
 
 
 def source_of(name: str) -> str:
@@ -80,10 +99,14 @@ def held_out(clips: Sequence[Clip], fold: int = 0) -> tuple[list[Clip], list[Cli
         raise ValueError(f"clips: expected at least two videos, because one is held out; got {len(sources)}")
     every = min(HELD_OUT_EVERY, len(sources))
     kept = set(sources[(every - 1 - fold) % every :: every])
-    # A longer cut of a video adds nothing new to train on.
+    train = [clip for clip in clips if clip.source not in kept]
+    return without_longer_cuts(train), [clip for clip in clips if clip.source in kept]
+
+
+def without_longer_cuts(clips: Sequence[Clip]) -> list[Clip]:
+    """Clips to train on: a longer cut adds nothing new to the clip that it continues."""
     names = {clip.name for clip in clips}
-    train = [c for c in clips if c.source not in kept and (c.name == c.source or c.source not in names)]
-    return train, [clip for clip in clips if clip.source in kept]
+    return [clip for clip in clips if clip.name == clip.source or clip.source not in names]
 
 
 def check_sizes(clips: Sequence[Clip], frames: int, side: int) -> None:
@@ -118,14 +141,15 @@ def _moved(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack([picture[r : r + side, c : c + side] for r, c in places])
 
 
-def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: int, side: int) -> np.ndarray:
-    """Random pieces of random clips, mirrored at random: [batch, frame, row, column, 3] of uint8.
+def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: int, side: int) -> Batch:
+    """Random pieces of random clips, mirrored at random.
 
     A shorter clip gives all its frames from a random one on, forth and back.
     """
-    out = np.empty((batch, frames, side, side, 3), np.uint8)
+    out = Batch(np.empty((batch, frames, side, side, 3), np.uint8), np.empty(batch, np.float32))
     for i in range(batch):
-        video = clips[int(rng.integers(len(clips)))].frames
+        clip = clips[int(rng.integers(len(clips)))]
+        video = clip.frames
         row, column = (rng.integers(n - side + 1) for n in video.shape[1:3])
         piece = video[_places(len(video), frames, rng), row : row + side, column : column + side]
         if rng.integers(2):
@@ -136,7 +160,7 @@ def crops(clips: Sequence[Clip], rng: np.random.Generator, batch: int, frames: i
             piece = piece.swapaxes(1, 2)
         if rng.integers(2):
             piece = piece[::-1]
-        out[i] = piece
+        out.frames[i], out.average[i] = piece, clip.average
     return out
 
 

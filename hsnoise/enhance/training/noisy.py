@@ -12,57 +12,30 @@ from jax.typing import ArrayLike
 
 from hsnoise._core.keys import named_key
 from hsnoise._core.types import cfa_tile
-from hsnoise.chain.photometry import GREY, photoelectrons_from_illuminance
 from hsnoise.effects import BlackLevel, DarkCurrent, ReadNoise, ShotNoise
 from hsnoise.enhance.mosaic import electrons_of, mosaic
+from hsnoise.enhance.training.protocol import OPTICS, Optics, middle_of, unit_of
 from hsnoise.model import NoiseModel, sample
 from hsnoise.simulation import cameras
 from hsnoise.simulation.draws import black_level_of
 
 JITTER = 0.1  # rms, of the logarithm of each non-negative parameter
 MATCH_SHAPE, MATCH_FRAMES = (256, 256), 8
-LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons of white, or lux
+LEAST_LIGHT, MOST_LIGHT = 1e-4, 1e6  # photoelectrons, or lux
 NOISES = ("hsnoise", "gaussian", "poisson-gaussian")
 Shape = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Optics:
-    """A camera's exposure and optics, which turn a scene's light into electrons, and its range in the paper (lux)."""
-
-    exposure_s: float
-    f_number: float
-    pixel_pitch_m: float
-    quantum_efficiency: float
-    lux: tuple[float, float]
-
-    def white_e(self, lux) -> ArrayLike:
-        """Photoelectrons of a pixel that sees a white surface in `lux`; the lens passes 1 / (4 N^2) of the light."""
-        return photoelectrons_from_illuminance(
-            lux / (4 * self.f_number**2),
-            exposure_s=self.exposure_s,
-            quantum_efficiency=self.quantum_efficiency,
-            pixel_pitch_m=self.pixel_pitch_m,
-        )
-
-
-# Exposure, f-number and illuminance: Wang et al., ICCV 2019. Pitch and quantum efficiency: data sheets.
-OPTICS = {
-    "canon_5d3": Optics(0.05, 5.6, 6.25e-6, 0.49, (0.05, 0.2)),
-    "grasshopper3": Optics(0.03, 1.8, 3.45e-6, 0.60, (0.01, 0.03)),
-}
-
-
-@dataclass(frozen=True)
 class Camera:
-    """A camera to train for: its noise, photoelectrons of white in dim and bright scenes, and its optics if known.
+    """A camera to train for: its noise, photoelectrons that dim and bright scenes average, and its optics if known.
 
     sensor: rows and columns of its frames, from which pieces are drawn; None: each piece is a whole frame.
     """
 
     name: str
     model: NoiseModel
-    white_e: tuple[float, float]
+    mean_e: tuple[float, float]
     optics: Optics | None = None
     sensor: Shape | None = None
 
@@ -70,15 +43,20 @@ class Camera:
     def channels(self) -> int:
         return len(self.model.channels)
 
-    def in_words(self, white_e: float) -> str:
-        """The light of a scene in which white has `white_e` photoelectrons."""
-        return f"{white_e:.2g} e-" if self.optics is None else f"{white_e / float(self.optics.white_e(1.0)):.2g} lux"
+    @property
+    def unit_e(self) -> float:
+        """Electrons, e-, that are 1 in the network's input."""
+        return unit_of(self.mean_e)
+
+    def in_words(self, mean_e: float) -> str:
+        """The light of a scene that averages `mean_e` photoelectrons."""
+        return f"{mean_e:.2g} e-" if self.optics is None else f"{mean_e / float(self.optics.mean_e(1.0)):.2g} lux"
 
 
 def camera_of(
     name: str,
     lux: tuple[float, float] | None,
-    white_e: tuple[float, float] | None,
+    mean_e: tuple[float, float] | None,
     exposure_s: float | None = None,
 ) -> Camera:
     """A built-in camera, or the one in a model.json at this exposure of a video frame (default: the model's own).
@@ -87,30 +65,30 @@ def camera_of(
         ValueError: an unknown camera or file; light that is missing, given twice or out of range; an exposure that is
             not above 0, or given with a built-in camera, which has its own.
     """
-    if lux is not None and white_e is not None:
-        raise ValueError(f"--lux, --white-e: both say how much light there is; expected one, got {lux} and {white_e}")
+    if lux is not None and mean_e is not None:
+        raise ValueError(f"--lux, --mean-e: both say how much light there is; expected one, got {lux} and {mean_e}")
     if name in OPTICS:
         if exposure_s is not None:
             raise ValueError(f"--exposure: goes with a model.json; {name} has {OPTICS[name].exposure_s:g} s")
-        return _built_in(name, lux, white_e)
+        return _built_in(name, lux, mean_e)
     if not Path(name).is_file():
         raise ValueError(f"--camera: expected a model.json or one of {', '.join(OPTICS)}, got {name}")
     model = NoiseModel.load(name)
-    if lux is not None or white_e is None:
-        raise ValueError("--white-e: needed with a model.json, which lacks the optics that --lux needs")
+    if lux is not None or mean_e is None:
+        raise ValueError("--mean-e: needed with a model.json, which lacks the optics that --lux needs")
     if exposure_s is not None:
         if not 0 < exposure_s < np.inf:
             raise ValueError(f"--exposure: expected seconds above 0, got {exposure_s:g}")
         model = at_exposure(model, exposure_s)
-    return Camera(Path(name).stem, model, checked_light("--white-e", white_e))
+    return Camera(Path(name).stem, model, checked_light("--mean-e", mean_e))
 
 
-def _built_in(name: str, lux: tuple[float, float] | None, white_e: tuple[float, float] | None) -> Camera:
+def _built_in(name: str, lux: tuple[float, float] | None, mean_e: tuple[float, float] | None) -> Camera:
     model, optics = getattr(cameras, name)(), OPTICS[name]
-    if white_e is None:
+    if mean_e is None:
         low, high = checked_light("--lux", lux or optics.lux)
-        white_e = float(optics.white_e(low)), float(optics.white_e(high))
-    return Camera(name, model, checked_light("--white-e", white_e), optics)
+        mean_e = float(optics.mean_e(low)), float(optics.mean_e(high))
+    return Camera(name, model, checked_light("--mean-e", mean_e), optics)
 
 
 def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float]:
@@ -137,7 +115,7 @@ def noise_of(kind: str, camera: Camera) -> NoiseModel:
     if kind == "hsnoise":
         return camera.model
     if kind in NOISES:
-        return matched(camera.model, kind, GREY * float(np.sqrt(np.prod(camera.white_e))))
+        return matched(camera.model, kind, middle_of(camera.mean_e))
     if not Path(kind).is_file():
         raise ValueError(f"--noise: expected a model.json or one of {', '.join(NOISES)}, got {kind}")
     model = NoiseModel.load(kind)
@@ -193,16 +171,24 @@ def jittered(key: jax.Array, model: NoiseModel, rms: float = JITTER) -> NoiseMod
 
 
 def noisy_of(
-    key: jax.Array, light: jax.Array, camera: NoiseModel, noise: NoiseModel, white_e, sensor: Shape | None = None
+    key: jax.Array,
+    light: jax.Array,
+    camera: NoiseModel,
+    noise: NoiseModel,
+    white_e: ArrayLike,
+    unit_e: ArrayLike,
+    sensor: Shape | None = None,
 ) -> jax.Array:
-    """Noisy frames from frames of light [frame, row, column, channel] (white is 1), in the same units.
+    """Noisy frames, in units of `unit_e` electrons, from frames of light [frame, row, column, channel] (white is 1).
 
-    `noise` makes the counts; black level, gain and dark current of `camera` turn them back to light.
+    `noise` makes the counts; black level, gain and dark current of `camera` turn them back to electrons.
+
+    white_e: photoelectrons of white in this scene, e-: those of its average, E[N_e], over the average of its light;
     sensor: as in Camera; the frames lie at a random place on it. Raises ValueError if they are larger.
     """
     photons = mosaic(light * white_e, noise.cfa)
     window = None if sensor is None else _somewhere(named_key(key, "place"), photons.shape, sensor, noise.cfa)
-    return electrons_of(sample(key, photons, noise, window=window), camera) / white_e
+    return electrons_of(sample(key, photons, noise, window=window), camera) / unit_e
 
 
 def _somewhere(key: jax.Array, shape: tuple[int, ...], sensor: Shape, cfa: str) -> tuple:

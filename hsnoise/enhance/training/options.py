@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from hsnoise._core.parsing import seconds
-from hsnoise.enhance.training.noisy import NOISES, OPTICS
+from hsnoise.enhance.training.noisy import NOISES
 from hsnoise.enhance.training.presets import PRESETS
+from hsnoise.enhance.training.protocol import OPTICS
 
 TRAIN = """Train the video enhancer on clean clips and the noise of a camera.
 
     hsnoise train                                        (2 minutes, on scikit-image's pictures)
     hsnoise train --preset cpu --clips FOLDER            (half an hour on 2 cores)
     hsnoise train --preset paper --clips FOLDER          (a GPU)
-    hsnoise train --camera hsnoise-fit/model.json --white-e 2,10
+    hsnoise train --camera hsnoise-fit/model.json --mean-e 2,10
 
 All output goes to --out: checkpoints, validation pictures, log.csv, and weights.eqx at the end. The same command
 resumes an interrupted run and ends with the same weights.
@@ -49,6 +50,7 @@ def _train_arguments(train: argparse.ArgumentParser) -> None:
     add("--noise", default="hsnoise", help=f"{', '.join(NOISES)} of the same strength, or a model.json")
     clips = "folder of videos, folders of images or .npz files (default: scikit-image's pictures)"
     add("--clips", type=Path, metavar="FOLDER", help=clips)
+    _split_argument(train, "trained on, and which validate")
     _light_arguments(train, "the paper's for the camera")
     add("--sensor", type=shape_of, metavar="ROWSxCOLUMNS", help=SENSOR)
     vgg = "torchvision's VGG-16 weights (.safetensors or .pth) for the perceptual term"
@@ -63,6 +65,7 @@ def _evaluate_arguments(evaluate: argparse.ArgumentParser) -> None:
     add("weights", type=Path, metavar="WEIGHTS", help="weights.eqx of a training")
     clips = "the folder that it was trained with; the clips that were held out are scored"
     add("--clips", type=Path, metavar="FOLDER", help=clips)
+    _split_argument(evaluate, "scored, and on which rivals are tuned")
     add(
         "--camera",
         help=f"model.json of a fit, or {', '.join(OPTICS)} (default: the built-in one that it was trained for)",
@@ -76,10 +79,15 @@ def _evaluate_arguments(evaluate: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("hsnoise-evaluate"), metavar="FOLDER", help="default: hsnoise-evaluate")
 
 
+def _split_argument(parser: argparse.ArgumentParser, use: str) -> None:
+    text = f"TOML file that says which clips are {use} (default: every fourth video is held out)"
+    parser.add_argument("--split", type=Path, metavar="FILE", help=text)
+
+
 def _light_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     add = parser.add_argument
     add("--lux", type=pair, metavar="LOW,HIGH", help=f"illuminance of the scene (default: {default})")
-    add("--white-e", type=pair, metavar="LOW,HIGH", help="instead of --lux: photoelectrons of white")
+    add("--mean-e", type=pair, metavar="LOW,HIGH", help="instead of --lux: photoelectrons of the average pixel")
     exposure = "exposure of a video frame, s, with a model.json (default: the model's own)"
     add("--exposure", type=seconds, metavar="S", help=exposure)
 

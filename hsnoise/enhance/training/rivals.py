@@ -1,7 +1,10 @@
-"""Methods that need no training: the scaled frame, non-local means, total variation, BM3D, BM4D.
+"""Methods that need no training: non-local means, total variation, BM3D, BM4D.
 
-Each gets the true noise of the frames (the standard deviation in flat areas), and the strength and the domain (linear
-light or display values) that do best on a clip that is not scored.
+Each gets frames at the brightness of an automatic exposure, the true noise of the frames, and the strength and the
+domain (linear light, display values, or the camera's variance stabilised) that do best on a clip that is not scored.
+
+BM4D over the frames of each colour stands in for VBM4D, which the paper compares with and which has no package: it
+groups cubes of pixels, where VBM4D follows motion first.
 """
 
 from __future__ import annotations
@@ -14,6 +17,9 @@ import numpy as np
 from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 
 from hsnoise.chain.photometry import display_from_linear
+from hsnoise.enhance.training.anscombe import Anscombe
+from hsnoise.enhance.training.protocol import scaled_to
+from hsnoise.enhance.training.scenes import Scene
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 WEIGHT_OF_SIGMA = 0.8  # of total variation, for a noise of 1
@@ -67,18 +73,37 @@ def not_installed() -> list[str]:
     return [name for name, (package, _) in PEERS.items() if not find_spec(package)]
 
 
-def denoised(denoise: Denoiser, noisy: np.ndarray, sigma: float, strength: float, linear: bool) -> np.ndarray:
-    """Display values of noisy linear light, denoised as linear light or as display values."""
-    if linear:
-        return np.asarray(display_from_linear(denoise(noisy.astype(float), strength * sigma)))
-    shown = np.clip(np.asarray(display_from_linear(noisy)), 0, 1)
+def _of_light(denoise: Denoiser, scene: Scene, strength: float) -> np.ndarray:
+    light = scene.noisy_e / scene.exposed_e
+    return np.asarray(display_from_linear(denoise(light, strength * scene.sigma_e / scene.exposed_e)))
+
+
+def _of_display(denoise: Denoiser, scene: Scene, strength: float) -> np.ndarray:
+    shown = np.clip(np.asarray(display_from_linear(scene.noisy_e / scene.exposed_e), float), 0, 1)
     # The display curve and clipping change the noise: measure it again, as a user would.
     apart = np.diff(shown, axis=0)
-    return denoise(shown.astype(float), strength * float(np.sqrt(0.5 * np.mean(apart**2))))
+    return denoise(shown, strength * float(np.sqrt(0.5 * np.mean(apart**2))))
 
 
-def tuned(denoise: Denoiser, noisy: np.ndarray, clean: np.ndarray, sigma: float) -> tuple[float, bool]:
-    """The strength and the domain (linear or not) with the least squared error on this clip."""
-    choices = [(strength, linear) for strength in STRENGTHS for linear in (True, False)]
-    errors = [np.mean((np.clip(denoised(denoise, noisy, sigma, *choice), 0, 1) - clean) ** 2) for choice in choices]
+def _of_stabilised(denoise: Denoiser, scene: Scene, strength: float) -> np.ndarray:
+    transform = Anscombe.of(scene.camera.model)
+    values = transform.forward(scene.noisy_e)
+    top = values.max()  # BM3D and BM4D expect values up to about 1
+    found_e = transform.inverse(top * denoise(values / top, strength / top))
+    return np.asarray(display_from_linear(found_e / scene.exposed_e))
+
+
+DOMAINS = {"linear light": _of_light, "display values": _of_display, "stabilised variance": _of_stabilised}
+
+
+def denoised(denoise: Denoiser, scene: Scene, strength: float, domain: str) -> np.ndarray:
+    """Display values of a scene, denoised in one of DOMAINS at `strength` times its noise."""
+    return DOMAINS[domain](denoise, scene, strength)
+
+
+def tuned(denoise: Denoiser, scene: Scene) -> tuple[float, str]:
+    """The strength and the domain with the least squared error on this scene, each at its best brightness."""
+    choices = [(strength, domain) for strength in STRENGTHS for domain in DOMAINS]
+    outputs = (denoised(denoise, scene, *choice) for choice in choices)
+    errors = [float(np.mean((scaled_to(found, scene.clean) - scene.clean) ** 2)) for found in outputs]
     return choices[int(np.argmin(errors))]

@@ -16,8 +16,10 @@ import optax
 
 from hsnoise._core.keys import named_key
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
+from hsnoise.enhance.training.clips import Batch
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, jittered, noisy_of
 from hsnoise.enhance.training.presets import Recipe
+from hsnoise.enhance.training.protocol import unit_of
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, loss
 
@@ -66,12 +68,12 @@ class Trainer:
     def network(self, state: tuple[STLSTM, Any]) -> STLSTM:
         return state[0]
 
-    def step(self, state: tuple[STLSTM, Any], batch: np.ndarray, seed: int, number: int):
-        """State after one more step, and the loss. batch: display values [batch, frame, row, column, 3], uint8."""
+    def step(self, state: tuple[STLSTM, Any], batch: Batch, seed: int, number: int):
+        """State after one more step, and the loss."""
         key = jax.random.fold_in(named_key(jax.random.key(seed), "noise"), number)
-        if self.sharding is not None and len(batch) % self.sharding.mesh.size == 0:
+        if self.sharding is not None and len(batch.frames) % self.sharding.mesh.size == 0:
             batch = jax.device_put(batch, self.sharding)
-        light = jnp.asarray(self.camera.white_e, jnp.float32)
+        light = jnp.asarray(self.camera.mean_e, jnp.float32)
         return self._step(state, batch, key, self.camera.model, self.noise, light)
 
 
@@ -97,7 +99,7 @@ def _step(optimiser, perceptual, checkpoint, jitter, sensor, state, batch, key, 
 
 
 def examples(
-    batch,
+    batch: Batch,
     key,
     camera: NoiseModel,
     noise: NoiseModel,
@@ -105,17 +107,18 @@ def examples(
     jitter: float = JITTER,
     sensor: Shape | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """Clean display values and noisy linear light [example, frame, row, column, channel] of display values (uint8).
+    """Clean display values, and noisy light in units of the camera, [example, frame, row, column, channel].
 
-    Each example has its own camera, changed by `jitter`, its own photoelectrons of white within `light`, and its own
-    place on the sensor, as in Camera.
+    Each example has its own camera, changed by `jitter`, its own E[N_e] within `light`, and its own place on the
+    sensor, as in Camera.
     """
-    linear = light_of_frames(batch, len(camera.channels))
+    linear = light_of_frames(batch.frames, len(camera.channels))
 
-    def one(key, linear):
+    def one(key, linear, average):
         of_light, of_camera, of_noise = (named_key(key, name) for name in ("light", "camera", "noise"))
-        white_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
-        return noisy_of(of_noise, linear, camera, jittered(of_camera, noise, jitter), white_e, sensor)
+        mean_e = light[0] * (light[1] / light[0]) ** jax.random.uniform(of_light, (), jnp.float32)
+        drawn = jittered(of_camera, noise, jitter)
+        return noisy_of(of_noise, linear, camera, drawn, mean_e / average, unit_of(light), sensor)
 
-    noisy = jax.vmap(one)(jax.random.split(key, len(batch)), linear)
+    noisy = jax.vmap(one)(jax.random.split(key, len(linear)), linear, batch.average)
     return display_from_linear(linear).astype(jnp.float32), noisy.astype(jnp.float32)

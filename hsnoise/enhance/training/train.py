@@ -19,9 +19,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from hsnoise._core.output import write_atomically
 from hsnoise.enhance.training import checkpoints, vgg
-from hsnoise.enhance.training.clips import check_sizes, crops, held_out, read_clips
+from hsnoise.enhance.training.clips import check_sizes, crops, read_clips
 from hsnoise.enhance.training.noisy import camera_of, noise_of
 from hsnoise.enhance.training.presets import PRESETS, Preset
+from hsnoise.enhance.training.protocol import PROTOCOL
+from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
 from hsnoise.enhance.training.validation import Validation
 from hsnoise.enhance.weights import load_network, save_network
@@ -43,11 +45,11 @@ def run(options: argparse.Namespace, console: Console) -> Path:
         raise ValueError(f"--seed: expected 0 to {MOST_SEED}, got {options.seed}")
     preset = chosen_preset(options)
     perceptual, vgg_digest = perceptual_of(options.vgg, console)
-    camera = replace(camera_of(options.camera, options.lux, options.white_e, options.exposure), sensor=options.sensor)
+    camera = replace(camera_of(options.camera, options.lux, options.mean_e, options.exposure), sensor=options.sensor)
     noise = noise_of(options.noise, camera)
-    train, kept = held_out(read_clips(options.clips))
+    train, kept, test = split_of(read_clips(options.clips), options.split)
     check_sizes([*train, *kept], preset.frames, preset.side)
-    about = description(preset, camera, noise, train, kept, options) | {"vgg": vgg_digest}
+    about = description(preset, camera, noise, train, kept, test, options) | {"vgg": vgg_digest}
     check_same_run(options.out, about)
     path = options.out / ENDED
     if has_ended(path, about):
@@ -56,7 +58,7 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     console.print(f"{len(train)} clips to train on, held out: {', '.join(clip.name for clip in kept)}")
     console.print(
         f"Camera {camera.name} at {camera.model.exposure_s:g} s, noise {options.noise},"
-        f" white of {camera.white_e[0]:.3g} to {camera.white_e[1]:.3g} e-"
+        f" scenes that average {camera.mean_e[0]:.3g} to {camera.mean_e[1]:.3g} e-"
     )
     trainer = Trainer(preset.recipe, preset.steps, camera, noise, perceptual)
     validation = Validation(kept, camera, preset.frames, options.out)
@@ -76,17 +78,20 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     return path
 
 
-def description(preset: Preset, camera, noise, train, kept, options: argparse.Namespace) -> dict:
+def description(preset: Preset, camera, noise, train, kept, test, options: argparse.Namespace) -> dict:
     """Everything that defines a run, in types that JSON can hold."""
     return {
         "preset": json.loads(json.dumps(asdict(preset))),
         "camera": camera.name,
         "noise": options.noise,
-        "white_e": list(camera.white_e),
+        "protocol": PROTOCOL,
+        "mean_e": list(camera.mean_e),
+        "unit_e": camera.unit_e,
         "sensor": None if camera.sensor is None else list(camera.sensor),
         "seed": options.seed,
         "clips": [clip.name for clip in train],
         "held_out": [clip.name for clip in kept],
+        "test": [clip.name for clip in test],
         "trained_on": [digest_of(clip.frames) for clip in train],
         "digests": {
             "camera": digest_of(camera.model),

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 from hsnoise._core.output import write_figure
-from hsnoise.chain.photometry import display_from_linear, light_of_frames
+from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Clip
-from hsnoise.enhance.training.noisy import Camera, noisy_of
+from hsnoise.enhance.training.noisy import Camera
+from hsnoise.enhance.training.protocol import middle_of
+from hsnoise.enhance.training.scenes import scene_of
 from hsnoise.stlstm import STLSTM
 
 CROP = 96
@@ -30,19 +31,16 @@ class Validation:
 
     def __init__(self, clips: Sequence[Clip], camera: Camera, frames: int, out: Path):
         self.out, self.last = out, float("nan")
-        white_e = float(np.sqrt(np.prod(camera.white_e)))
+        mean_e = middle_of(camera.mean_e)
         self.names = [clip.name for clip in clips[:MOST_CLIPS]]
         clean, noisy = [], []
         side = min(CROP, *(n // 2 * 2 for clip in clips for n in clip.frames.shape[1:3]))
         frames = min(frames, *(len(clip.frames) for clip in clips))
         for i, clip in enumerate(clips[:MOST_CLIPS]):
-            row, column = ((n - side) // 2 for n in clip.frames.shape[1:3])
-            light = light_of_frames(clip.frames[:frames, row : row + side, column : column + side], camera.channels)
-            clean.append(np.asarray(display_from_linear(light)))
-            noisy.append(
-                np.asarray(noisy_of(jax.random.key(i), light, camera.model, camera.model, white_e, camera.sensor))
-            )
-        self.clean, self.noisy = np.stack(clean, 1), np.stack(noisy, 1).astype(np.float32)
+            scene = scene_of(clip, camera, mean_e, side, i, frames)
+            clean.append(scene.clean)
+            noisy.append(scene.noisy)
+        self.clean, self.noisy = np.stack(clean, 1), np.stack(noisy, 1)
         self.refer = psnr_db(np.asarray(display_from_linear(self.noisy)), self.clean)
         self._video = eqx.filter_jit(lambda net, noisy: net.video(noisy))
 
