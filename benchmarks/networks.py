@@ -4,27 +4,30 @@
 
 Every network sees the same noise and the same pieces of the same clips in the same order, for the same time of training
 (without compilation; or the same number of steps, `--steps`). Its learning rate falls by a cosine from the best of
-three, each tried for a sixth of that time and judged on clips that are neither trained on nor tested. Each has the loss
-of its paper. Networks with a window are trained on the frames that have one, and tested on all frames of a video that
-is reflected at its ends: unlike the ST-LSTM they also see later frames. Finished trainings are kept in `--out`; the
-same command resumes.
+three, each tried for a sixth of that time and judged on the split's validation clips, which are neither trained on nor
+tested. Each has the loss of its paper. Networks with a window are trained on the frames that have one, and tested on
+all frames of a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. Outputs are scored
+as they are, and scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command
+resumes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 from rich.console import Console
 from rich.progress import track
 from skimage.metrics import structural_similarity
@@ -35,15 +38,18 @@ from benchmarks.rivals.ffdnet import FFDNet
 from benchmarks.rivals.kpn import KPN
 from benchmarks.rivals.layers import Noise, Rival, noise_map_of
 from benchmarks.rivals.toflow import TOFlow
+from hsnoise._core.keys import named_key
 from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
-from hsnoise.chain.photometry import display_from_linear, light_of_frames, linear_from_display
-from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
-from hsnoise.enhance.training.noisy import Camera, camera_of, noisy_of
-from hsnoise.enhance.training.presets import Recipe
-from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
+from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
+from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of
+from hsnoise.enhance.training.protocol import middle_of, scaled_to
+from hsnoise.enhance.training.scenes import Scene, scene_of
+from hsnoise.enhance.training.split import split_of
+from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import read_arrays, write_arrays
+from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, loss
 
 OURS = "ST-LSTM"
@@ -52,8 +58,10 @@ RATES = (3e-4, 1e-3, 3e-3)
 TRIAL = 1 / 6  # of the budget, for each rate
 BATCH, FRAMES, SIDE = 4, 8, 64
 MAPS, STRIDE = 64, 4  # of the ST-LSTM
-VALIDATED, LEVELS, TIMED = 3, 3, 5
+LEVELS, TESTED_FRAMES, TIMED = 3, 16, 5
 SEED = 0
+SPLIT = Path(__file__).parent / "split.toml"
+OPTIMISER = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0))  # as `hsnoise train`; rates are arguments
 SCORES = ("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled")
 
 
@@ -85,13 +93,16 @@ class Budget:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What all trainings share. unit_e: photoelectrons that are 1 in the networks' input; digest: of it all."""
+    """What all trainings share.
+
+    model: the camera's, in single precision; noise: for noise maps; digest: of the camera, its light and all clips.
+    """
 
     camera: Camera
-    unit_e: float
+    model: NoiseModel
     noise: Noise
     train: Sequence[Clip]
-    chosen_on: Sequence[Clip]
+    validation: Sequence[Clip]
     width: float
     out: Path
     digest: str
@@ -103,46 +114,30 @@ class Setting:
         maps = max(1, round(MAPS * self.width))
         return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels))
 
-    def batch(self, step: int) -> np.ndarray:
+    def batch(self, step: int) -> Batch:
         return crops(self.train, batch_rng(SEED, step), BATCH, FRAMES, SIDE)
 
-    def trainer(self, name: str, rate: float, steps: int) -> Trainer:
-        return Trainer(
-            Recipe(rate=rate),
-            steps,
-            self.camera,
-            self.camera.model,
-            make=self.make(name),
-            objective=lambda net, *of: net.loss(*of),
-            unit_e=self.unit_e,
-        )
+    def start(self, name: str) -> tuple[Any, Any]:
+        """The untrained network and its optimiser's state."""
+        net = self.make(name)(named_key(jax.random.key(SEED), "network"))
+        return net, OPTIMISER.init(eqx.filter(net, eqx.is_array))
+
+    def step(self, state: tuple[Any, Any], number: int, steps: int, rate: float) -> tuple[tuple[Any, Any], jax.Array]:
+        """State after step `number` of `steps`, and the loss."""
+        key = jax.random.fold_in(named_key(jax.random.key(SEED), "noise"), number)
+        light, done = jnp.asarray(self.camera.mean_e, jnp.float32), number / steps
+        rates = jnp.asarray([rate * (1 + math.cos(math.pi * done)) / 2, done], jnp.float32)
+        return _step(state, self.batch(number), key, self.model, light, self.camera.sensor, *rates)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A clip in some light: clean display values and noisy linear light [frame, row, column, channel]."""
-
-    clip: Clip
-    white_e: float
-    clean: np.ndarray
-    noisy: np.ndarray
-
-
-def scene_of(setting: Setting, clip: Clip, white_e: float, crop: int, seed: int) -> Scene:
-    """The middle `crop` pixels of a clip, with noise."""
-    side = [min(crop, n) for n in clip.frames.shape[1:3]]
-    row, column = ((n - s) // 2 for n, s in zip(clip.frames.shape[1:3], side, strict=True))
-    camera = setting.camera
-    light = light_of_frames(clip.frames[:, row : row + side[0], column : column + side[1]], camera.channels)
-    noisy = noisy_of(jax.random.key(seed), light, camera.model, camera.model, white_e, camera.sensor)
-    shown = np.asarray(display_from_linear(light), np.float32)
-    return Scene(clip, white_e, shown, np.asarray(noisy, np.float32) * np.float32(white_e / setting.unit_e))
-
-
-def scaled_to(found: np.ndarray, clean: np.ndarray) -> np.ndarray:
-    """Display values `found` with the mean linear light of `clean`."""
-    light, wanted = (np.asarray(linear_from_display(np.clip(of, 0, 1))) for of in (found, clean))
-    return np.asarray(display_from_linear(light * (wanted.mean() / max(light.mean(), 1e-6))))
+@eqx.filter_jit
+def _step(state, batch: Batch, key, model: NoiseModel, light, sensor: Shape | None, rate, done):
+    net, memory = state
+    pair = examples(batch, key, model, model, light, JITTER, sensor)
+    clean, noisy = (frames.swapaxes(0, 1) for frames in pair)
+    value, slope = eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, done))(net)
+    change, memory = OPTIMISER.update(slope, memory)
+    return (eqx.apply_updates(net, jax.tree.map(lambda of: rate * of, change)), memory), value
 
 
 def scores_of(found: np.ndarray, scene: Scene) -> dict[str, float]:
@@ -164,28 +159,30 @@ def _enhanced(net, noisy: jax.Array) -> jax.Array:
 @cache
 def seconds_a_step(setting: Setting, name: str) -> float:
     """Median time of a few steps, after compilation."""
-    trainer = setting.trainer(name, RATES[0], TIMED)
-    state, times = trainer.start(SEED), []
-    for step in range(TIMED + 1):
+    state, times = setting.start(name), []
+    for number in range(TIMED + 1):
         begun = time.monotonic()
-        state, value = trainer.step(state, setting.batch(step), SEED, step)
+        state, value = setting.step(state, number, TIMED + 1, RATES[0])
         value.block_until_ready()
         times.append(time.monotonic() - begun)
     return float(np.median(times[1:]))
 
 
+def named(setting: Setting, name: str, budget: Budget) -> str:
+    length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
+    return f"{name}-{setting.width:g}-{length}-{setting.digest}"
+
+
 def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[Any, dict]:
     """The network after training, and what is known of it: read from `--out` if a finished one is there."""
-    length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
-    path = setting.out / f"{name}-{setting.width:g}-{rate:g}-{length}-{setting.digest}.eqx"
+    path = setting.out / f"{named(setting, name, budget)}-{rate:g}.eqx"
     if path.exists():
         return read_arrays(path, eqx.filter_eval_shape(setting.make(name), jax.random.key(0)))
     steps = budget.steps or max(1, int(60 * budget.minutes / seconds_a_step(setting, name)))
-    trainer = setting.trainer(name, rate, steps)
-    trainer.step(trainer.start(SEED), setting.batch(0), SEED, 0)  # compiles
-    state, begun, text = trainer.start(SEED), time.monotonic(), f"{name}, rate {rate:g}"
-    for step in track(range(steps), text, console=Console(stderr=True), transient=True):
-        state, value = trainer.step(state, setting.batch(step), SEED, step)
+    setting.step(setting.start(name), 0, steps, rate)  # compiles
+    state, begun, text = setting.start(name), time.monotonic(), f"{name}, rate {rate:g}"
+    for number in track(range(steps), text, console=Console(stderr=True), transient=True):
+        state, value = setting.step(state, number, steps, rate)
     about = {"network": name, "rate": rate, "steps": steps, "loss": float(value)}
     about |= {"minutes": (time.monotonic() - begun) / 60, "parameters": parameters_of(state[0])}
     write_arrays(path, state[0], about)
@@ -199,8 +196,9 @@ def parameters_of(net: Any) -> int:
 
 def best_rate(setting: Setting, name: str, budget: Budget, crop: int) -> float:
     """The rate with the highest PSNR on the validation clips after a short training."""
-    white_e = float(np.sqrt(np.prod(setting.camera.white_e)))
-    scenes = [scene_of(setting, clip, white_e, crop, seed) for seed, clip in enumerate(setting.chosen_on)]
+    mean_e = middle_of(setting.camera.mean_e)
+    clips = enumerate(setting.validation)
+    scenes = [scene_of(clip, setting.camera, mean_e, crop, seed, TESTED_FRAMES) for seed, clip in clips]
 
     def quality(rate: float) -> float:
         net, _ = trained(setting, name, rate, budget.part(TRIAL))
@@ -216,7 +214,7 @@ def tested(net: Any, scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
     """Scores of each video, means over levels of light."""
     found: dict[str, list[dict[str, float]]] = {}
     for scene in scenes:
-        found.setdefault(scene.clip.name, []).append(scores_of(np.asarray(_enhanced(net, scene.noisy)), scene))
+        found.setdefault(scene.clip, []).append(scores_of(np.asarray(_enhanced(net, scene.noisy)), scene))
     return {
         clip: {what: float(np.mean([of[what] for of in all_of])) for what in SCORES} for clip, all_of in found.items()
     }
@@ -246,39 +244,35 @@ def tables(results: dict[str, dict]) -> tuple[Sheet, Sheet]:
 
 
 def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
-    """What is shared, and the clips to test on. Raises ValueError for unusable clips, camera or light."""
-    camera = camera_of(options.camera, options.lux, options.white_e)
-    train, kept = held_out(read_clips(options.clips))
-    check_sizes([*train, *kept], FRAMES, SIDE)
-    if len({clip.source for clip in train}) <= VALIDATED:
-        raise ValueError(
-            f"--clips: expected more than {VALIDATED} videos to train on, because {VALIDATED} choose the rate"
-        )
-    unit_e = camera.white_e[1]
+    """What is shared, and the clips to test on. Raises ValueError for unusable clips, split, camera or light."""
+    camera = camera_of(options.camera, options.lux, options.mean_e)
+    training, *others = split_of(read_clips(options.clips), options.split)
+    validation, test = ([clip for clip in clips if not clip.is_long] for clips in others)
+    check_sizes([*training, *validation, *test], FRAMES, SIDE)
     options.out.mkdir(parents=True, exist_ok=True)
-    noise = noise_map_of(camera, unit_e)
-    step = len(train) // VALIDATED
-    chosen_on = train[::step][:VALIDATED]
-    chosen = {clip.source for clip in chosen_on}
-    rest = [clip for clip in train if clip.source not in chosen]
-    digest = digest_of(camera.model, camera.white_e, unit_e, [clip.frames for clip in rest])[:8]
-    setting = Setting(camera, unit_e, noise, rest, chosen_on, options.width, options.out, digest)
-    return setting, [clip for clip in kept if not clip.is_long]
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), camera.model)
+    digest = digest_of(camera.model, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
+    noise = noise_map_of(camera)
+    return Setting(camera, model, noise, training, validation, options.width, options.out, digest), test
 
 
 def run(options: argparse.Namespace) -> None:
     """Train, score and write the tables. Raises ValueError as `setting_of`."""
-    setting, kept = setting_of(options)
-    numbers = count(1000)
-    levels = np.geomspace(*setting.camera.white_e, LEVELS)
-    scenes = [scene_of(setting, clip, float(level), options.crop, next(numbers)) for clip in kept for level in levels]
+    setting, test = setting_of(options)
+    tasks = [(clip, float(level)) for clip in test for level in np.geomspace(*setting.camera.mean_e, LEVELS)]
+    scenes = [
+        scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
+        for number, (clip, level) in enumerate(tasks)
+    ]
     budget = Budget(None if options.steps else options.minutes, options.steps)
     results: dict[str, dict] = {}
     for name in options.networks:
-        net, about = trained(setting, name, best_rate(setting, name, budget, options.crop), budget)
-        results[name] = about | {"clips": tested(net, scenes)}
+        path = options.out / f"{named(setting, name, budget)}-{options.crop}.json"
+        if not path.exists():
+            net, about = trained(setting, name, best_rate(setting, name, budget, options.crop), budget)
+            write_atomically(path, json.dumps(about | {"clips": tested(net, scenes)}, indent=1).encode())
+        results[name] = json.loads(path.read_text())
         sheets = tables(results)
-        write_atomically(options.out / "networks.json", json.dumps(results, indent=1).encode())
         write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
     for sheet in sheets:
         Console(width=150).print(sheet.rich())
@@ -288,12 +282,18 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     names = (OURS, *RIVALS)
-    add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
+    add("--clips", type=Path, required=True, help="folder of clean clips")
+    add(
+        "--split",
+        type=Path,
+        default=SPLIT,
+        help="which clips train, validate and test (default: benchmarks/split.toml)",
+    )
     add("--minutes", type=float, default=10.0, help="of training, for each network (default: 10)")
     add("--steps", type=int, help="steps of training for each network, instead of minutes")
     add("--camera", default="canon_5d3", help="canon_5d3, grasshopper3 or a model.json (default: canon_5d3)")
     add("--lux", type=float, nargs=2, help="dim and bright light of the scenes (default: the paper's)")
-    add("--white-e", type=float, nargs=2, help="photoelectrons of white, with a model.json instead of --lux")
+    add("--mean-e", type=float, nargs=2, help="photoelectrons that scenes average, with a model.json instead of --lux")
     add("--width", type=float, default=0.25, help="numbers of feature maps over the published ones (default: 0.25)")
     add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
     add("--networks", nargs="+", default=names, choices=names, help="default: all")

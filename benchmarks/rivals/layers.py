@@ -35,19 +35,19 @@ class Noise:
         return jnp.sqrt(jnp.maximum(frames, 0) * shot + dark)
 
 
-def noise_map_of(camera: Camera, unit_e: float) -> Noise:
-    """The noise that a camera's parameters imply where `unit_e` photoelectrons are 1 in the networks' input.
+def noise_map_of(camera: Camera) -> Noise:
+    """The noise that a camera's parameters imply.
 
     The variance of darks is measured on drawn ones before they are clipped, because light lifts frames off the limit.
     """
     model, channels, tile = camera.model, camera.channels, cfa_tile(camera.model.cfa)
     open_ended = model.remove("adc") if "adc" in model else model
     dark = jnp.zeros((*DARK_SHAPE, channels), jnp.float32)
-    drawn = np.asarray(noisy_of(jax.random.key(0), dark, model, open_ended, 1.0), np.float64)
-    variance_e2 = 0.5 * np.mean(np.diff(drawn, axis=0) ** 2, axis=(0, 1, 2))
+    drawn = np.asarray(noisy_of(jax.random.key(0), dark, model, open_ended, 0.0, camera.unit_e), np.float64)
+    variance = 0.5 * np.mean(np.diff(drawn, axis=0) ** 2, axis=(0, 1, 2))
     # A pixel of the frame is the mean of the sensor's pixels of its colour.
-    shot = tuple(1 / (unit_e * int(np.sum(tile == channel))) for channel in range(channels))
-    return Noise(shot, tuple(float(of) / unit_e**2 for of in variance_e2))
+    shot = tuple(1 / (camera.unit_e * int(np.sum(tile == channel))) for channel in range(channels))
+    return Noise(shot, tuple(map(float, variance)))
 
 
 def rms(x: jax.Array) -> jax.Array:
