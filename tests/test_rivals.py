@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -13,7 +14,7 @@ import numpy as np
 import optax
 import pytest
 
-from benchmarks.networks import RIVALS, tables
+from benchmarks.networks import RIVALS, main, tables
 from benchmarks.rivals.fastdvdnet import STRIDE
 from benchmarks.rivals.kpn import BURST, KERNEL, filtered
 from benchmarks.rivals.layers import Noise, displayed_with_noise, noise_map_of
@@ -70,31 +71,30 @@ def test_published_sizes(name, channels):
     assert sum(math.prod(leaf.shape) for leaf in leaves) == PARAMETERS[name, channels]
 
 
-@pytest.mark.parametrize("name", RIVALS)
-def test_training_lowers_the_loss_and_odd_frames_keep_their_size(name):
+@pytest.mark.parametrize("name", ["KPN", "TOFlow", "FastDVDnet", pytest.param("FFDNet", marks=pytest.mark.slow)])
+def test_steps_down_a_finite_slope_lower_the_loss(name):
     net, (noisy, clean) = small(name), scene(side=16)
-    optimiser = optax.adam(1e-3)
-
-    @eqx.filter_jit
-    def step(net, memory):
-        value, slope = eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, jnp.float32(0.5)))(net)
-        change, memory = optimiser.update(slope, memory)
-        return eqx.apply_updates(net, change), memory, value, slope
-
-    memory, values = optimiser.init(eqx.filter(net, eqx.is_array)), []
+    of_loss = eqx.filter_jit(eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, jnp.float32(0.5))))
+    values = []
     for _ in range(6):
-        net, memory, value, slope = step(net, memory)
+        value, slope = of_loss(net)
         values.append(float(value))
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+        slopes = [np.asarray(leaf) for leaf in jax.tree.leaves(slope)]
+        assert all(np.isfinite(of).all() for of in slopes) and any(of.any() for of in slopes)
+        length = 0.05 / np.sqrt(sum(np.sum(of**2) for of in slopes))
+        net = jax.tree.map(lambda leaf, of, length=length: leaf - np.float32(length) * np.asarray(of), net, slope)
     assert values[-1] < 0.95 * values[0]
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_odd_frames_keep_their_size(name):
     shape = (3, 2, 9, 11, 3)
-    assert jax.eval_shape(net.whole_video, jax.ShapeDtypeStruct(shape, jnp.float32)).shape == shape
+    assert jax.eval_shape(small(name).whole_video, jax.ShapeDtypeStruct(shape, jnp.float32)).shape == shape
 
 
-SLOW = ("KPN", "TOFlow")  # to compile
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else []) for n in RIVALS])
+@pytest.mark.parametrize(
+    "name", ["FastDVDnet", *(pytest.param(n, marks=pytest.mark.slow) for n in ("FFDNet", "KPN", "TOFlow"))]
+)
 def test_frames_beyond_the_window_do_not_matter_and_those_within_do(name):
     net, noisy = small(name), scene(frames=12)[0][:, :, :16, :16]
     video = eqx.filter_jit(net.whole_video)
@@ -206,6 +206,7 @@ def test_fastdvdnet_moves_with_its_input_by_whole_strides():
         assert np.allclose(moved[:, 40 + shift : 56 + shift, inside], still, atol=1e-4) == same
 
 
+@pytest.mark.slow
 def test_fastdvdnet_shares_triples_as_separate_windows_would():
     net, (noisy, _) = small("FastDVDnet"), scene(frames=7, side=16)
     whole = np.asarray(eqx.filter_jit(net.video)(noisy))
@@ -228,3 +229,40 @@ def test_differences_are_paired_over_clips():
 def test_width_must_be_positive():
     with pytest.raises(ValueError, match="width: expected a number above 0, got 0"):
         RIVALS["KPN"](KEY, GREY, width=0)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--steps", "0"], "--minutes, --steps: expected more than 0, got 10.0, 0"),
+        (["--crop", "32"], "at least 64, got 0.25, 32"),
+        (["--rates", "-1"], "--rates: expected above 0, got [-1.0]"),
+        ([], "--clips: expected a folder"),
+    ],
+)
+def test_bad_options_are_named(tmp_path, capsys, more, words):
+    with pytest.raises(SystemExit):
+        main(["--clips", str(tmp_path / "none"), *more])
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_trains_scores_and_keeps_what_is_finished(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    for name in "abc":
+        frames = np.kron(rng.integers(40, 200, (8, 16, 16, 3)), np.ones((1, 4, 4, 1))).astype(np.uint8)
+        np.savez(tmp_path / f"{name}.npz", frames=frames)
+    (tmp_path / "split.toml").write_text('training = ["a"]\nvalidation = ["b"]\ntest = ["c"]\n')
+    out = tmp_path / "out"
+    given = ["--clips", tmp_path, "--split", tmp_path / "split.toml", "--out", out, "--networks", "FFDNet"]
+    command = [*map(str, given), "--steps", "6", "--width", "0.125", "--crop", "64", "--rates", "1e-3", "3e-3"]
+    main(command)
+    first = capsys.readouterr().out
+    assert "FFDNet: " in first and "6 steps" in first and "| FFDNet |" in (out / "networks.md").read_text()
+    found = json.loads(next(out.glob("*.json")).read_text())
+    assert set(found["clips"]) == {"c"} and found["steps"] == 6 and found["parameters"] > 0
+    next(out.glob("*.json")).unlink()  # the scores, as if interrupted before them
+    main(command)
+    again = capsys.readouterr().out
+    assert "steps" not in again.split("Held-out")[0]
+    assert json.loads(next(out.glob("*.json")).read_text())["clips"] == found["clips"]

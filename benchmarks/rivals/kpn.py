@@ -98,8 +98,8 @@ class KPN(Rival):
         """
         single, wanted = self._single(frames), joined(self.with_window(clean))
         weight = BETA ** (1 - done / SINGLE)
-        each = jnp.sum(jnp.stack([_basic(displayed(one), wanted) for one in single]))
-        return _basic(displayed(single.mean(0)), wanted) + weight * each
+        each = _basic(displayed(single), wanted[None])
+        return _basic(displayed(single.mean(0)), wanted) + weight * BURST * each
 
 
 def filtered(bursts: jax.Array, kernels: jax.Array) -> jax.Array:
@@ -114,5 +114,5 @@ def filtered(bursts: jax.Array, kernels: jax.Array) -> jax.Array:
 
 def _basic(found: jax.Array, clean: jax.Array) -> jax.Array:
     apart = found - clean
-    slopes = sum(jnp.mean(jnp.abs(jnp.diff(apart, axis=axis))) for axis in (1, 2))
+    slopes = sum(jnp.mean(jnp.abs(jnp.diff(apart, axis=axis))) for axis in (-3, -2))
     return jnp.mean(apart**2) + slopes
