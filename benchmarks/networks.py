@@ -5,10 +5,10 @@
 Every network sees the same noise and the same pieces of the same clips in the same order, for the same time of training
 (without compilation; or the same number of steps, `--steps`). Its learning rate falls by a cosine from the best of
 three, each tried for a sixth of that time and judged on the split's validation clips, which are neither trained on nor
-tested. Each has the loss of its paper. Networks with a window are trained on the frames that have one, and tested on
-all frames of a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. Outputs are scored
-as they are, and scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command
-resumes.
+tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained on
+those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of a
+video that is reflected at its ends: unlike the ST-LSTM they also see later frames. Outputs are scored as they are, and
+scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def with_error(values: Sequence[float], digits: int, sign: str = "") -> str:
     return f"{np.mean(values):{sign}.{digits}f} +- {standard_error(values):.{digits}f}"
 
 
-def tables(results: dict[str, dict]) -> tuple[Sheet, Sheet]:
+def tables(results: dict[str, dict]) -> list[Sheet]:
     """Scores of each network, and those of the ST-LSTM less each rival's; standard errors over videos."""
     digits = dict(zip(SCORES, (2, 3, 2, 3), strict=True))
     heads = ("PSNR / dB", "SSIM", "PSNR scaled / dB", "SSIM scaled")
@@ -240,12 +240,14 @@ def tables(results: dict[str, dict]) -> tuple[Sheet, Sheet]:
     ]
     less = [(f"{OURS} - {name}", *row(OURS, name)) for name in results if name != OURS and OURS in results]
     first = ("network", "parameters", "steps", "minutes", "rate", *heads)
-    return Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *heads), less)
+    sheets = Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *heads), less)
+    return [sheet for sheet in sheets if sheet.rows]
 
 
 def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     """What is shared, and the clips to test on. Raises ValueError for unusable clips, split, camera or light."""
-    camera = camera_of(options.camera, options.lux, options.mean_e)
+    light = (None if of is None else tuple(of) for of in (options.lux, options.mean_e))
+    camera = camera_of(options.camera, *light)
     training, *others = split_of(read_clips(options.clips), options.split)
     validation, test = ([clip for clip in clips if not clip.is_long] for clips in others)
     check_sizes([*training, *validation, *test], FRAMES, SIDE)
@@ -275,7 +277,7 @@ def run(options: argparse.Namespace) -> None:
         results[name] = json.loads(path.read_text())
         sheets = tables(results)
         write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
-    for sheet in sheets[: len(results)]:  # one network has no differences
+    for sheet in sheets:
         Console(width=150).print(sheet.rich())
 
 
