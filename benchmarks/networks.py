@@ -19,7 +19,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from rich.console import Console
-from rich.progress import track
 from skimage.metrics import structural_similarity
 
 from benchmarks.noise_ablation import standard_error
@@ -58,7 +57,7 @@ RATES = (3e-4, 1e-3, 3e-3)
 TRIAL = 1 / 6  # of the budget, for each rate
 BATCH, FRAMES, SIDE = 4, 8, 64
 MAPS, STRIDE = 64, 4  # of the ST-LSTM
-LEVELS, TESTED_FRAMES, TIMED = 3, 10, 5  # 10: all clips have as many, so that networks are compiled once
+LEVELS, TESTED_FRAMES = 3, 10  # 10: all clips have as many, so that networks are compiled once
 SEED = 0
 SPLIT = Path(__file__).parent / "split.toml"
 OPTIMISER = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0))  # as `hsnoise train`; rates are arguments
@@ -122,10 +121,10 @@ class Setting:
         net = self.make(name)(named_key(jax.random.key(SEED), "network"))
         return net, OPTIMISER.init(eqx.filter(net, eqx.is_array))
 
-    def step(self, state: tuple[Any, Any], number: int, steps: int, rate: float) -> tuple[tuple[Any, Any], jax.Array]:
-        """State after step `number` of `steps`, and the loss."""
+    def step(self, state: tuple[Any, Any], number: int, done: float, rate: float) -> tuple[tuple[Any, Any], jax.Array]:
+        """State after step `number`, when this share of the training is done, and the loss."""
         key = jax.random.fold_in(named_key(jax.random.key(SEED), "noise"), number)
-        light, done = jnp.asarray(self.camera.mean_e, jnp.float32), number / steps
+        light = jnp.asarray(self.camera.mean_e, jnp.float32)
         rates = jnp.asarray([rate * (1 + math.cos(math.pi * done)) / 2, done], jnp.float32)
         return _step(state, self.batch(number), key, self.model, light, self.camera.sensor, *rates)
 
@@ -156,18 +155,6 @@ def _enhanced(net, noisy: jax.Array) -> jax.Array:
     return net.whole_video(noisy[:, None])[:, 0]
 
 
-@cache
-def seconds_a_step(setting: Setting, name: str) -> float:
-    """Median time of a few steps, after compilation."""
-    state, times = setting.start(name), []
-    for number in range(TIMED + 1):
-        begun = time.monotonic()
-        state, value = setting.step(state, number, TIMED + 1, min(RATES))
-        value.block_until_ready()
-        times.append(time.monotonic() - begun)
-    return float(np.median(times[1:]))
-
-
 def named(setting: Setting, name: str, budget: Budget) -> str:
     length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
     return f"{name}-{setting.width:g}-{length}-{setting.digest}"
@@ -178,15 +165,17 @@ def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[A
     path = setting.out / f"{named(setting, name, budget)}-{rate:g}.eqx"
     if path.exists():
         return read_arrays(path, eqx.filter_eval_shape(setting.make(name), jax.random.key(0)))
-    steps = budget.steps or max(1, int(60 * budget.minutes / seconds_a_step(setting, name)))
-    setting.step(setting.start(name), 0, steps, rate)  # compiles
-    state, begun, text = setting.start(name), time.monotonic(), f"{name}, rate {rate:g}"
-    for number in track(range(steps), text, console=Console(stderr=True), transient=True):
-        state, value = setting.step(state, number, steps, rate)
-    about = {"network": name, "rate": rate, "steps": steps, "loss": float(value)}
+    setting.step(setting.start(name), 0, 0.0, rate)[1].block_until_ready()  # compiles
+    state, begun, number, done = setting.start(name), time.monotonic(), 0, 0.0
+    while done < 1:
+        state, value = setting.step(state, number, done, rate)
+        value.block_until_ready()
+        number += 1
+        done = number / budget.steps if budget.steps else (time.monotonic() - begun) / (60 * budget.minutes)
+    about = {"network": name, "rate": rate, "steps": number, "loss": float(value)}
     about |= {"minutes": (time.monotonic() - begun) / 60, "parameters": parameters_of(state[0])}
     write_arrays(path, state[0], about)
-    print(f"{text}: {steps} steps in {about['minutes']:.1f} min, loss {about['loss']:.4f}", flush=True)
+    print(f"{name}, rate {rate:g}: {number} steps in {about['minutes']:.1f} min, loss {about['loss']:.4f}", flush=True)
     return state[0], about
 
 
