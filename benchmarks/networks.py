@@ -1,0 +1,310 @@
+"""The ST-LSTM against published networks, trained alike: PSNR and SSIM on held-out clips.
+
+    python -m benchmarks.networks --clips FOLDER --minutes 10 --camera canon_5d3 --out build/networks
+
+Every network sees the same noise and the same pieces of the same clips in the same order, for the same time of training
+(without compilation; or the same number of steps, `--steps`). Its learning rate falls by a cosine from the best of
+three, each tried for a sixth of that time and judged on the split's validation clips, which are neither trained on nor
+tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained
+on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
+a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. Outputs are scored as they are,
+and scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from rich.console import Console
+from skimage.metrics import structural_similarity
+
+from benchmarks.noise_ablation import standard_error
+from benchmarks.rivals.fastdvdnet import FastDVDnet
+from benchmarks.rivals.ffdnet import FFDNet
+from benchmarks.rivals.kpn import KPN
+from benchmarks.rivals.layers import Noise, Rival, noise_map_of
+from benchmarks.rivals.toflow import TOFlow
+from hsnoise._core.keys import named_key
+from hsnoise._core.output import write_atomically
+from hsnoise._core.sheet import Sheet
+from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
+from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of
+from hsnoise.enhance.training.protocol import middle_of, scaled_to
+from hsnoise.enhance.training.scenes import Scene, scene_of
+from hsnoise.enhance.training.split import split_of
+from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
+from hsnoise.enhance.training.validation import psnr_db
+from hsnoise.enhance.weights import read_arrays, write_arrays
+from hsnoise.model import NoiseModel
+from hsnoise.stlstm import STLSTM, loss
+
+OURS = "ST-LSTM"
+RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
+RATES = (3e-4, 1e-3, 3e-3)
+TRIAL = 1 / 6  # of the budget, for each rate
+BATCH, FRAMES, SIDE = 4, 8, 64
+MAPS, STRIDE = 64, 4  # of the ST-LSTM
+LEVELS, TESTED_FRAMES = 3, 10  # 10: all clips have as many, so that networks are compiled once
+SEED = 0
+SPLIT = Path(__file__).parent / "split.toml"
+OPTIMISER = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0))  # as `hsnoise train`; rates are arguments
+SCORES = ("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled")
+
+
+class Ours(eqx.Module):
+    """The ST-LSTM as the rivals are used."""
+
+    net: STLSTM
+
+    def whole_video(self, frames: jax.Array) -> jax.Array:
+        return self.net.video(frames)
+
+    def loss(self, frames: jax.Array, clean: jax.Array, done: jax.Array) -> jax.Array:
+        return loss(self.net.video(frames), clean)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a training may use: minutes, or a number of steps."""
+
+    minutes: float | None
+    steps: int | None
+
+    def part(self, share: float) -> Budget:
+        return Budget(
+            None if self.minutes is None else share * self.minutes,
+            None if self.steps is None else max(1, round(share * self.steps)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What all trainings share.
+
+    model: the camera's, in single precision; noise: for noise maps; digest: of the camera, its light and all clips.
+    """
+
+    camera: Camera
+    model: NoiseModel
+    noise: Noise
+    train: Sequence[Clip]
+    validation: Sequence[Clip]
+    width: float
+    out: Path
+    digest: str
+
+    def make(self, name: str) -> Callable[[jax.Array], Any]:
+        """The network of this name, from a random key."""
+        if name in RIVALS:
+            return partial(RIVALS[name], noise=self.noise, width=self.width)
+        maps = max(1, round(MAPS * self.width))
+        return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels))
+
+    def batch(self, step: int) -> Batch:
+        return crops(self.train, batch_rng(SEED, step), BATCH, FRAMES, SIDE)
+
+    def start(self, name: str) -> tuple[Any, Any]:
+        """The untrained network and its optimiser's state."""
+        net = self.make(name)(named_key(jax.random.key(SEED), "network"))
+        return net, OPTIMISER.init(eqx.filter(net, eqx.is_array))
+
+    def step(self, state: tuple[Any, Any], number: int, done: float, rate: float) -> tuple[tuple[Any, Any], jax.Array]:
+        """State after step `number`, when this share of the training is done, and the loss."""
+        key = jax.random.fold_in(named_key(jax.random.key(SEED), "noise"), number)
+        light = jnp.asarray(self.camera.mean_e, jnp.float32)
+        rates = jnp.asarray([rate * (1 + math.cos(math.pi * done)) / 2, done], jnp.float32)
+        return _step(state, self.batch(number), key, self.model, light, self.camera.sensor, *rates)
+
+
+@eqx.filter_jit
+def _step(state, batch: Batch, key, model: NoiseModel, light, sensor: Shape | None, rate, done):
+    net, memory = state
+    pair = examples(batch, key, model, model, light, JITTER, sensor)
+    clean, noisy = (frames.swapaxes(0, 1) for frames in pair)
+    value, slope = eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, done))(net)
+    change, memory = OPTIMISER.update(slope, memory)
+    return (eqx.apply_updates(net, jax.tree.map(lambda of: rate * of, change)), memory), value
+
+
+def scores_of(found: np.ndarray, scene: Scene) -> dict[str, float]:
+    """PSNR and SSIM as it is and scaled in brightness to the truth, means over frames."""
+
+    def measured(frames: np.ndarray) -> tuple[float, float]:
+        pairs = list(zip(np.clip(frames, 0, 1), scene.clean, strict=True))
+        ssim = [structural_similarity(a, b, channel_axis=-1, data_range=1.0) for a, b in pairs]
+        return float(np.mean([psnr_db(a, b) for a, b in pairs])), float(np.mean(ssim))
+
+    return dict(zip(SCORES, (*measured(found), *measured(scaled_to(found, scene.clean))), strict=True))
+
+
+@eqx.filter_jit
+def _enhanced(net, noisy: jax.Array) -> jax.Array:
+    return net.whole_video(noisy[:, None])[:, 0]
+
+
+def named(setting: Setting, name: str, budget: Budget) -> str:
+    length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
+    return f"{name}-{setting.width:g}-{length}-{setting.digest}"
+
+
+def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[Any, dict]:
+    """The network after training, and what is known of it: read from `--out` if a finished one is there."""
+    path = setting.out / f"{named(setting, name, budget)}-{rate:g}.eqx"
+    if path.exists():
+        return read_arrays(path, eqx.filter_eval_shape(setting.make(name), jax.random.key(0)))
+    setting.step(setting.start(name), 0, 0.0, rate)[1].block_until_ready()  # compiles
+    state, begun, number, done = setting.start(name), time.monotonic(), 0, 0.0
+    while done < 1:
+        state, value = setting.step(state, number, done, rate)
+        value.block_until_ready()
+        number += 1
+        done = number / budget.steps if budget.steps else (time.monotonic() - begun) / (60 * budget.minutes)
+    about = {"network": name, "rate": rate, "steps": number, "loss": float(value)}
+    about |= {"minutes": (time.monotonic() - begun) / 60, "parameters": parameters_of(state[0])}
+    write_arrays(path, state[0], about)
+    print(f"{name}, rate {rate:g}: {number} steps in {about['minutes']:.1f} min, loss {about['loss']:.4f}", flush=True)
+    return state[0], about
+
+
+def parameters_of(net: Any) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(net, eqx.is_array)))
+
+
+def best_rate(setting: Setting, name: str, budget: Budget, rates: Sequence[float], crop: int) -> float:
+    """The rate with the highest PSNR on the validation clips after a short training."""
+    mean_e = middle_of(setting.camera.mean_e)
+    clips = enumerate(setting.validation)
+    scenes = [scene_of(clip, setting.camera, mean_e, crop, seed, TESTED_FRAMES) for seed, clip in clips]
+
+    def quality(rate: float) -> float:
+        net, _ = trained(setting, name, rate, budget.part(TRIAL))
+        return float(np.mean([psnr_db(np.asarray(_enhanced(net, scene.noisy)), scene.clean) for scene in scenes]))
+
+    found = {rate: quality(rate) for rate in rates}
+    print(f"{name}: " + ", ".join(f"{value:.2f} dB at rate {rate:g}" for rate, value in found.items()), flush=True)
+    # A diverged training has no PSNR.
+    return max(rates, key=lambda rate: found[rate] if np.isfinite(found[rate]) else -np.inf)
+
+
+def tested(net: Any, scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
+    """Scores of each video, means over levels of light."""
+    found: dict[str, list[dict[str, float]]] = {}
+    for scene in scenes:
+        found.setdefault(scene.clip, []).append(scores_of(np.asarray(_enhanced(net, scene.noisy)), scene))
+    return {
+        clip: {what: float(np.mean([of[what] for of in all_of])) for what in SCORES} for clip, all_of in found.items()
+    }
+
+
+def with_error(values: Sequence[float], digits: int, sign: str = "") -> str:
+    return f"{np.mean(values):{sign}.{digits}f} +- {standard_error(values):.{digits}f}"
+
+
+def tables(results: dict[str, dict]) -> list[Sheet]:
+    """Scores of each network, and those of the ST-LSTM less each rival's; standard errors over videos."""
+    digits = dict(zip(SCORES, (2, 3, 2, 3), strict=True))
+    heads = ("PSNR / dB", "SSIM", "PSNR scaled / dB", "SSIM scaled")
+
+    def row(name: str, less: str | None = None) -> tuple[str, ...]:
+        of = results[name]["clips"]
+        apart = {w: [of[c][w] - (results[less]["clips"][c][w] if less else 0.0) for c in of] for w in SCORES}
+        return tuple(with_error(values, digits[what], "+" if less else "") for what, values in apart.items())
+
+    own = [
+        (name, f"{of['parameters']:,}", f"{of['steps']:,}", f"{of['minutes']:.1f}", f"{of['rate']:g}", *row(name))
+        for name, of in results.items()
+    ]
+    less = [(f"{OURS} - {name}", *row(OURS, name)) for name in results if name != OURS and OURS in results]
+    first = ("network", "parameters", "steps", "minutes", "rate", *heads)
+    sheets = Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *heads), less)
+    return [sheet for sheet in sheets if sheet.rows]
+
+
+def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
+    """What is shared, and the clips to test on. Raises ValueError for unusable clips, split, camera or light."""
+    light = (None if of is None else tuple(of) for of in (options.lux, options.mean_e))
+    camera = camera_of(options.camera, *light)
+    training, *others = split_of(read_clips(options.clips), options.split)
+    validation, test = ([clip for clip in clips if not clip.is_long] for clips in others)
+    check_sizes([*training, *validation, *test], FRAMES, SIDE)
+    options.out.mkdir(parents=True, exist_ok=True)
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), camera.model)
+    digest = digest_of(camera.model, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
+    noise = noise_map_of(camera)
+    return Setting(camera, model, noise, training, validation, options.width, options.out, digest), test
+
+
+def run(options: argparse.Namespace) -> None:
+    """Train, score and write the tables. Raises ValueError as `setting_of`."""
+    setting, test = setting_of(options)
+    tasks = [(clip, float(level)) for clip in test for level in np.geomspace(*setting.camera.mean_e, LEVELS)]
+    scenes = [
+        scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
+        for number, (clip, level) in enumerate(tasks)
+    ]
+    budget = Budget(None if options.steps else options.minutes, options.steps)
+    results: dict[str, dict] = {}
+    for name in options.networks:
+        rates = "-".join(f"{rate:g}" for rate in options.rates)
+        path = options.out / f"{named(setting, name, budget)}-{rates}-{options.crop}.json"
+        if not path.exists():
+            net, about = trained(setting, name, best_rate(setting, name, budget, options.rates, options.crop), budget)
+            write_atomically(path, json.dumps(about | {"clips": tested(net, scenes)}, indent=1).encode())
+        results[name] = json.loads(path.read_text())
+        sheets = tables(results)
+        write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
+    for sheet in sheets:
+        Console(width=150).print(sheet.rich())
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    names = (OURS, *RIVALS)
+    add("--clips", type=Path, required=True, help="folder of clean clips")
+    add(
+        "--split",
+        type=Path,
+        default=SPLIT,
+        help="which clips train, validate and test (default: benchmarks/split.toml)",
+    )
+    add("--minutes", type=float, default=10.0, help="of training, for each network (default: 10)")
+    add("--steps", type=int, help="steps of training for each network, instead of minutes")
+    add("--rates", type=float, nargs="+", default=RATES, help="learning rates that are tried (default: 3e-4 1e-3 3e-3)")
+    add("--camera", default="canon_5d3", help="canon_5d3, grasshopper3 or a model.json (default: canon_5d3)")
+    add("--lux", type=float, nargs=2, help="dim and bright light of the scenes (default: the paper's)")
+    add("--mean-e", type=float, nargs=2, help="photoelectrons that scenes average, with a model.json instead of --lux")
+    add("--width", type=float, default=0.25, help="numbers of feature maps over the published ones (default: 0.25)")
+    add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
+    add("--networks", nargs="+", default=names, choices=names, help="default: all")
+    add("--out", type=Path, default=Path("build/networks"), help="default: build/networks")
+    options = parser.parse_args(argv)
+    if options.minutes <= 0 or (options.steps is not None and options.steps < 1):
+        parser.error(f"--minutes, --steps: expected more than 0, got {options.minutes}, {options.steps}")
+    if min(options.rates) <= 0:
+        parser.error(f"--rates: expected above 0, got {options.rates}")
+    if options.width <= 0 or options.crop < SIDE:
+        parser.error(f"--width, --crop: expected above 0 and at least {SIDE}, got {options.width:g}, {options.crop}")
+    try:
+        run(options)
+    except ValueError as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        parser.exit(130, "Interrupted; the same command resumes\n")
+
+
+if __name__ == "__main__":
+    main()
