@@ -316,10 +316,10 @@ def test_weights_are_judged_with_the_camera_and_light_of_their_training(folder, 
         run_evaluate(judge)
     assert "--camera: the weights were trained for model" in capsys.readouterr().err
     run_evaluate([*judge, "--camera", str(model)])
-    assert "another camera" not in capsys.readouterr().out
+    assert "other noise" not in capsys.readouterr().out
     assert "2 e- to 10 e-" in (tmp_path / "found" / "evaluation.md").read_text()
     run_evaluate([*judge, "--camera", str(other)])
-    assert "another camera" in capsys.readouterr().out
+    assert "other noise" in capsys.readouterr().out
 
 
 def mono_camera(mean_e=(20.0, 20.0)):

@@ -56,7 +56,7 @@ def rms(x: jax.Array) -> jax.Array:
 
 
 def displayed(light: jax.Array) -> jax.Array:
-    """Display values of linear light, odd about black: in a line below it, the noise of darks would be ten times white."""
+    """Display values of linear light, odd about black: along a line below it, noise of darks would exceed white."""
     return (jnp.sign(light) * display_from_linear(jnp.abs(light))).astype(jnp.float32)
 
 

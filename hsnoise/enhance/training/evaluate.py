@@ -73,7 +73,7 @@ def camera_for(about: dict, options: argparse.Namespace) -> Camera:
     sensor = options.sensor or (tuple(about["sensor"]) if about.get("sensor") else None)
     camera = replace(camera_of(name, options.lux, mean_e, options.exposure), sensor=sensor)
     if about.get("digests", {}).get("camera") != digest_of(camera.model):
-        print(f"Note: {options.weights} was trained for another camera ({about.get('camera')}), not {camera.name}")
+        print(f"Note: {options.weights} was trained for other noise than that of {camera.name}, on which it is scored")
     return camera
 
 
