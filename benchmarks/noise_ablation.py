@@ -4,9 +4,11 @@
 
 The same network is trained for the same steps with (a) independent Gaussian noise of the sensor's variance, (b) shot
 and read noise on the sensor's line of variance against mean, (c) the paper's model as hsnoise fits it, (d) that model
-after `hsnoise.improve`. The networks are tested on held-out clips whose light, with shot noise, is added to dark frames
-of the sensor that no fit has seen. Real and drawn frames both have the level of their darks subtracted. Finished parts
-are kept in `--out`; the same command resumes.
+after `hsnoise.improve`. Two limits: (e) light and its shot noise on the real dark frames that were fitted, which is the
+most that a noise model can give, and (f) the same with their pixels shuffled, all frames alike: real distributions
+without structure. The networks are tested on held-out clips whose light, with shot noise, is added to dark frames of
+the sensor that no fit has seen. Real and drawn frames both have the level of their darks subtracted. Finished parts are
+kept in `--out`; the same command resumes. The settings of the runs in docs/results.md are those of ablation.toml.
 
 The sensors' data are in a folder outside the project (HSNOISE_SHARED, or ../shared).
 """
@@ -16,9 +18,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -29,98 +31,29 @@ from rich.console import Console
 from rich.progress import track
 
 import hsnoise
+from benchmarks._ablation_sensors import Sensor, sensors
 from hsnoise import NoiseModel
 from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.enhance.mosaic import electrons_of
-from hsnoise.enhance.training.clips import Clip, check_sizes, crops, held_out, read_clips
+from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.protocol import PROTOCOL, middle_of
 from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import load_network, save_network
-from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 
 NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
+REAL, SHUFFLED = "real darks", "shuffled darks"
+LIMITS = (REAL, SHUFFLED)
+SETTINGS = Path(__file__).parent / "ablation.toml"
 DIM, BRIGHT = 0.4, 1.6  # photoelectrons of the average, in standard deviations of a dark frame
 BATCH, FRAMES, CROP = 4, 8, 128
-OUTSIDE, NEAR = 6.0, 3.0  # standard deviations
+NEAR = 3.0  # standard deviations
 MATCH_SIDE = 256
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """A real sensor: the capture to fit, and dark frames [frame, row, column] of one exposure that no fit sees."""
-
-    name: str
-    fitted: hsnoise.FrameStack
-    unseen: np.ndarray
-    exposure_s: float
-
-    @cached_property
-    def fitted_darks(self) -> np.ndarray:
-        """The fitted darks nearest in exposure, DN [frame, row, column]."""
-        stack = self.fitted
-        darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-        chosen = min(darks, key=lambda i: abs(stack.exposure_s[i] - self.exposure_s))
-        return np.stack([stack.frame(chosen, i) for i in range(stack.n_frames[chosen])]).astype(np.float64)
-
-    @cached_property
-    def dark_sigma_dn(self) -> float:
-        """Temporal standard deviation of these darks, DN, before they were rounded to counts.
-
-        From differences of frames.
-        """
-        apart = np.diff(self.fitted_darks, axis=0)
-        # Cosmic rays are rare and huge: differences far outside the others are clipped to just outside.
-        low, high = np.quantile(apart, [0.1587, 0.8413])
-        far = OUTSIDE * (high - low) / 2
-        return float(np.sqrt(np.mean(np.clip(apart, -far, far) ** 2) / 2 - ROUNDING_VARIANCE))
-
-    def dark_sigma_e(self, params: NoiseModel) -> float:
-        return self.dark_sigma_dn / float(np.mean(np.asarray(params["gain"].value)))
-
-
-def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
-    def read(name: str):
-        return np.load(folder / f"{name}.npz"), json.loads((folder / f"{name}.json").read_text())["arrays"]
-
-    def stack(data, about, frames: dict[str, slice], white: float) -> hsnoise.FrameStack:
-        return hsnoise.FrameStack(
-            [data[name][part] for name, part in frames.items()],
-            [about[name]["exposure_s"] for name in frames],
-            kind=["flat" if name.startswith("flat") else "dark" for name in frames],
-            white_level=white,
-            cfa="mono",
-            shutter="global",
-        )
-
-    def imx541() -> Sensor:
-        # The rows that darks and flats share; six of the eight frames of an exposure are fitted.
-        data, about = read("imx541_mono_emva")
-        darks = {n: (slice(6), slice(128)) for n in ("dark_000025us", "dark_006443us")}
-        flats = {n: (slice(None), slice(128)) for n in ("flat_000272us", "flat_000985us")}
-        # At most 6 ms without light, and cooled: the exposures differ only in length.
-        unseen = np.concatenate([data[n][6:] for n in data.files if n.startswith("dark")])
-        return Sensor("imx541", stack(data, about, darks | flats, 4095), unseen, about["dark_000272us"]["exposure_s"])
-
-    def stl1001() -> Sensor:
-        data, about = read("sbig_stl1001_ccd")
-        frames = {n: (slice(5), slice(128)) for n in ("bias_m05C", "dark_m05C_060s")}
-        frames["flat_m05C_023s"] = (slice(None), slice(128))
-        exposure_s = about["dark_m05C_060s"]["exposure_s"]
-        return Sensor("stl1001", stack(data, about, frames, 65535), data["dark_m05C_060s"][5:], exposure_s)
-
-    def tc237() -> Sensor:
-        data, about = read("sbig_st7e_tc237_ccd_clipped")
-        middle = slice(100, 300), slice(200, 456)
-        frames = {"bias": (slice(4), *middle), "flat_006s": (slice(None), *middle)}
-        return Sensor("tc237", stack(data, about, frames, 65535), data["bias"][(slice(4, None), *middle)], 0.0)
-
-    return {"imx541": imx541, "stl1001": stl1001, "tc237": tc237}
 
 
 def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
@@ -166,22 +99,29 @@ def drawn_darks(noise: NoiseModel) -> np.ndarray:
     return np.asarray(hsnoise.sample_dark(jax.random.key(0), FRAMES, (MATCH_SIDE, MATCH_SIDE), noise), np.float64)
 
 
-def trained(camera: Camera, name: str, noise: NoiseModel, clips, seed: int, options) -> Path:
-    """Path of the weights of a network trained with the noise called `name`."""
-    camera = levelled(camera, level_of(drawn_darks(noise)))
+def trained(
+    camera: Camera, name: str, noise: NoiseModel | np.ndarray, clips: Sequence[Clip], seed: int, options
+) -> Path:
+    """Path of the weights of a network trained with the noise called `name`: a model's, or that of dark frames."""
+    model = camera.model if isinstance(noise, np.ndarray) else noise
+    if model is noise:
+        camera = levelled(camera, level_of(drawn_darks(model)))
     sizes = (options.stride, options.side, options.jitter, camera.sensor, camera.mean_e, PROTOCOL)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
         return path
     trainer = Trainer(
-        Recipe(maps=options.maps, stride=options.stride), options.steps, camera, noise, jitter=options.jitter
+        Recipe(maps=options.maps, stride=options.stride), options.steps, camera, model, jitter=options.jitter
     )
     state = trainer.start(seed)
     text = f"{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
         batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, options.side)
-        state, value = trainer.step(state, batch, seed, step)
+        if model is noise:
+            state, value = trainer.step(state, batch, seed, step)
+        else:
+            state, value = trainer.learn(state, *real_examples(batch, noise, camera, batch_rng(seed + 1, step)))
     about = {"camera": camera.name, "noise": name, "steps": options.steps, "clips": [clip.name for clip in clips]}
     save_network(path, trainer.network(state), about)
     print(f"{text}: loss {float(value):.4f}", flush=True)
@@ -194,6 +134,41 @@ def camera_of(sensor: Sensor, paper: NoiseModel) -> Camera:
     return levelled(camera, level_of(sensor.fitted_darks))
 
 
+def shuffled(darks: np.ndarray) -> np.ndarray:
+    """Dark frames [frame, row, column] whose pixels have changed places, in all frames alike."""
+    order = np.random.default_rng(0).permutation(darks[0].size)
+    return darks.reshape(len(darks), -1)[:, order].reshape(darks.shape)
+
+
+def on_darks(light: np.ndarray, white_e: float, darks: np.ndarray, camera: Camera, rng: np.random.Generator):
+    """Noisy light, in units of the camera [frame, row, column, 1], of light [frame, row, column, 1] (white is 1).
+
+    With its shot noise it is added to dark frames [frame, row, column], in any order, at a random place of the sensor.
+    """
+    n, rows, columns = light.shape[:3]
+    row, column = (rng.integers(most - size + 1) for most, size in zip(darks.shape[1:], (rows, columns), strict=True))
+    order = rng.permutation(np.arange(max(n, len(darks))) % len(darks))[:n]
+    dark = darks[order, row : row + rows, column : column + columns]
+    gain = float(np.mean(np.asarray(camera.model["gain"].value)))
+    counts = np.rint(dark + gain * rng.poisson(light[..., 0] * white_e))
+    return np.asarray(electrons_of(counts, camera.model), np.float32) / camera.unit_e
+
+
+def random_white_e(average: float, camera: Camera, rng: np.random.Generator) -> float:
+    """Photoelectrons of white, e-, in a scene whose light has this average, and E[N_e] somewhere in the range."""
+    return float(np.exp(rng.uniform(*np.log(camera.mean_e)))) / average
+
+
+def real_examples(
+    batch: Batch, darks: np.ndarray, camera: Camera, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Clean display values and noisy light [example, frame, row, column, 1] on darks, as `examples` makes them."""
+    linear = np.asarray(light_of_frames(batch.frames, 1))
+    white = [random_white_e(float(average), camera, rng) for average in batch.average]
+    noisy = [on_darks(light, white_e, darks, camera, rng) for light, white_e in zip(linear, white, strict=True)]
+    return np.asarray(display_from_linear(linear), np.float32), np.stack(noisy).astype(np.float32)
+
+
 def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Display values and noisy light in units of the camera [frame, row, column, 1].
 
@@ -201,16 +176,11 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
     are dark frames; the seed chooses the place on the sensor.
     """
     rng = np.random.default_rng(seed)
-    white_e = float(np.exp(rng.uniform(*np.log(camera.mean_e)))) / clip.average
     n = min(len(sensor.unseen), len(clip.frames))
     side = min(CROP, *sensor.unseen.shape[1:], *clip.frames.shape[1:3])
     row, column = ((size - side) // 2 for size in clip.frames.shape[1:3])
     light = np.asarray(light_of_frames(clip.frames[:n, row : row + side, column : column + side], 1))
-    row, column = (rng.integers(size - side + 1) for size in sensor.unseen.shape[1:])
-    dark = sensor.unseen[rng.permutation(len(sensor.unseen))[:n], row : row + side, column : column + side]
-    gain = float(np.mean(np.asarray(camera.model["gain"].value)))
-    counts = np.rint(dark + gain * rng.poisson(light[..., 0] * white_e))
-    noisy = np.asarray(electrons_of(counts, camera.model)) / camera.unit_e
+    noisy = on_darks(light, random_white_e(clip.average, camera, rng), sensor.unseen, camera, rng)
     return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
 
 
@@ -230,27 +200,45 @@ def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], 
 
 
 def table_of(results: dict[str, dict[str, list[dict[str, float]]]]) -> Sheet:
-    """Mean PSNR of each sensor and noise over seeds and clips, and the gain over (b) with its standard error."""
-    head = ("sensor", *NOISES, "paper - poisson-gaussian", "improved - poisson-gaussian")
+    """Mean PSNR of each sensor and noise over seeds and clips, and gains over (b) with their standard errors.
+
+    Last the share of what training on real darks gains that the improved model gains, too.
+    """
+    over = ("paper", "improved", REAL)
+    head = ("sensor", *NOISES, *LIMITS, *(f"{name} - poisson-gaussian" for name in over), "share of the gap closed")
     rows = []
     for sensor, of in results.items():
-        row = [sensor, *(f"{np.mean([v for clips in of[name] for v in clips.values()]):.2f}" for name in NOISES)]
-        for name in ("paper", "improved"):
-            pairs = zip(of[name], of["poisson-gaussian"], strict=True)
-            mean, error = gain_of([{clip: one[clip] - other[clip] for clip in one} for one, other in pairs])
-            row.append(f"{mean:+.2f} +- {error:.2f} dB")
-        rows.append(tuple(row))
+        means = [np.mean([v for clips in of[name] for v in clips.values()]) for name in (*NOISES, *LIMITS)]
+        gains = {name: gain_of(apart(of[name], of["poisson-gaussian"])) for name in over}
+        told = [f"{mean:+.2f} +- {error:.2f} dB" for mean, error in gains.values()]
+        rows.append((sensor, *(f"{mean:.2f}" for mean in means), *told, _share(of, gains)))
     return Sheet("PSNR on real dark frames, dB", head, rows)
 
 
-def gain_of(apart: list[dict[str, float]]) -> tuple[float, float]:
+def apart(one: list[dict[str, float]], other: list[dict[str, float]], share: float = 1.0) -> list[dict[str, float]]:
+    """Differences {clip: dB} of two noises, seed by seed: the first less this share of the other."""
+    return [{clip: of[clip] - share * less[clip] for clip in of} for of, less in zip(one, other, strict=True)]
+
+
+def _share(of: dict[str, list[dict[str, float]]], gains: dict[str, tuple[float, float]]) -> str:
+    """Gain of the improved model over that of real darks, its error from clips; none if real darks gain nothing."""
+    (ours, _), (most, error) = gains["improved"], gains[REAL]
+    if most < 2 * error or most <= 0:
+        return "no gap beyond chance"
+    share, base = ours / most, of["poisson-gaussian"]
+    _, error = gain_of(apart(apart(of["improved"], base), apart(of[REAL], base), share))
+    return f"{100 * share:.0f} +- {100 * error / most:.0f} %"
+
+
+def gain_of(differences: list[dict[str, float]]) -> tuple[float, float]:
     """Mean of differences {clip: dB} of several seeds, and its standard error: over clips or seeds, if larger.
 
     Seeds hold out different clips, so both contain the scatter between clips, and the second that between trainings.
     If more seeds repeat the clips, only the first contains the scatter between clips, and both are added.
     """
-    of_clips = [[of[clip] for of in apart if clip in of] for clip in sorted({clip for of in apart for clip in of})]
-    of_seeds = [list(of.values()) for of in apart]
+    clips = sorted({clip for of in differences for clip in of})
+    of_clips = [[of[clip] for of in differences if clip in of] for clip in clips]
+    of_seeds = [list(of.values()) for of in differences]
     errors = [standard_error([float(np.mean(values)) for values in groups]) for groups in (of_clips, of_seeds)]
     repeated = any(len(values) > 1 for values in of_clips)
     return float(np.mean([value for of in of_seeds for value in of])), float(np.hypot(*errors)) if repeated else max(
@@ -267,21 +255,21 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
-    add("--sensors", default="imx541,stl1001,tc237", help="default: imx541,stl1001,tc237")
-    add("--seeds", type=int, default=4, help="trainings with each noise; each holds out different clips (default: 4)")
-    add("--steps", type=int, default=2000, help="steps of each training (default: 2000)")
-    add("--maps", type=int, default=12, help="feature maps of the network (default: 12)")
-    add("--stride", type=int, default=2, help="side of a block of the network: 4 sees twice as far (default: 2)")
-    add("--side", type=int, default=32, help="side of the training crops, pixels (default: 32)")
+    add("--sensors", help="separated by commas")
+    add("--seeds", type=int, help="trainings with each noise; each holds out different clips")
+    add("--steps", type=int, help="steps of each training")
+    add("--maps", type=int, help="feature maps of the network")
+    add("--stride", type=int, help="side of a block of the network: 4 sees twice as far as 2")
+    add("--side", type=int, help="side of the training crops, pixels")
     add(
         "--jitter",
         type=float,
-        default=0.0,
-        help="rms by which the logarithms of the noise's parameters vary in training (default: 0, the fit as it is:"
-        " a dark current that varies moves the black of all noises but the Gaussian, which has it in its black level)",
+        help="rms by which the logarithms of the noise's parameters vary in training (0: the fit as it is; a dark"
+        " current that varies moves the black of all noises but the Gaussian, which has it in its black level)",
     )
-    add("--places", type=int, default=3, help="places on the sensor for each clip (default: 3)")
+    add("--places", type=int, help="places on the sensor for each clip")
     add("--out", type=Path, default=Path("build/ablation"), help="default: build/ablation")
+    parser.set_defaults(**tomllib.loads(SETTINGS.read_text()))
     options = parser.parse_args(argv)
     folder = Path(os.environ.get("HSNOISE_SHARED", "../shared")) / "data"
     known, asked = sensors(folder), options.sensors.split(",")
@@ -308,12 +296,13 @@ def main(argv: list[str] | None = None) -> None:
         sensor = known[name]()
         models = models_of(sensor, options.out)
         camera = camera_of(sensor, models["paper"])
-        of: dict[str, list[dict[str, float]]] = {noise: [] for noise in NOISES}
+        noises = {**models, REAL: sensor.fitted_darks, SHUFFLED: shuffled(sensor.fitted_darks)}
+        of: dict[str, list[dict[str, float]]] = {name: [] for name in noises}
         for seed, (train, kept) in enumerate(folds):
             shown = [clip for clip in kept if not clip.is_long]
-            for noise in NOISES:
-                path = trained(camera, noise, models[noise], train, seed, options)
-                of[noise].append(measured(sensor, path, camera, shown, options.places))
+            for noise_name, noise in noises.items():
+                path = trained(camera, noise_name, noise, train, seed, options)
+                of[noise_name].append(measured(sensor, path, camera, shown, options.places))
         results[name] = of
         sheet = table_of(results)
         Console(width=130).print(sheet.rich())

@@ -15,11 +15,11 @@ import hsnoise
 from benchmarks import noise_ablation
 from benchmarks.evaluate import main as run_evaluate
 from benchmarks.train import main as run_train
-from hsnoise.chain.photometry import display_from_linear
+from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.effects import ADC, BlackLevel, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.training import checkpoints, evaluate, train
-from hsnoise.enhance.training.clips import Clip, crops, held_out, read_clips
+from hsnoise.enhance.training.clips import Batch, Clip, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, camera_of
 from hsnoise.enhance.training.presets import Preset, Recipe
 from hsnoise.enhance.training.protocol import scaled_to
@@ -332,6 +332,22 @@ def mono_camera(mean_e=(20.0, 20.0)):
     return Camera("sensor", model, mean_e)
 
 
+def test_real_darks_train_as_drawn_ones_do(rng):
+    camera = mono_camera()
+    darks = np.asarray(hsnoise.sample_dark(jax.random.key(0), 3, (40, 50), camera.model), float)
+    darks += 4 * rng.standard_normal((40, 50))  # pixels differ
+    pieces = np.full((4, 8, 32, 32, 3), 188, np.uint8)
+    batch = Batch(pieces, np.full(4, 0.5))
+    clean, noisy = noise_ablation.real_examples(batch, darks, camera, rng)
+    light = np.asarray(light_of_frames(pieces, 1))
+    assert clean.shape == noisy.shape == light.shape
+    assert noisy.mean() * camera.unit_e == pytest.approx(20 * float(light.mean()) / 0.5, rel=0.02)
+    mixed = noise_ablation.shuffled(darks)
+    np.testing.assert_array_equal(np.sort(mixed.reshape(3, -1)), np.sort(darks.reshape(3, -1)))
+    np.testing.assert_allclose(np.sort(mixed.var(0), axis=None), np.sort(darks.var(0), axis=None))  # pixels stay whole
+    assert not np.array_equal(mixed, darks)
+
+
 @pytest.mark.slow
 def test_light_is_added_to_real_dark_frames():
     camera = mono_camera()
@@ -373,9 +389,12 @@ def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
         return [{clip: value + by * apart[i][clip] for clip, value in of.items()} for i, of in enumerate(base)]
 
     of = {"gaussian": moved(-1), "poisson-gaussian": base, "paper": moved(1), "improved": moved(2)}
+    of |= {noise_ablation.REAL: moved(4), noise_ablation.SHUFFLED: base}
     text = noise_ablation.table_of({"imx541": of}).markdown()
     over_clips = np.std([0.9, 1.3, 1.1, 1.5], ddof=1) / 2
     assert f"| +1.20 +- {over_clips:.2f} dB |" in text and "| 23.00 | 24.20 |" in text
+    assert "| 50 +- 0 % |" in text
+    assert "no gap beyond chance" in noise_ablation.table_of({"imx541": of | {noise_ablation.REAL: base}}).markdown()
     # Trainings that differ by more than clips do count; a clip that two of them saw counts once.
     mean, error = noise_ablation.gain_of([{"a": 1.0, "b": 1.2}, {"a": 2.0, "b": 2.2}])
     assert (mean, error) == pytest.approx((1.6, np.hypot(0.1, 0.5)))

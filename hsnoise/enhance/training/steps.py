@@ -38,7 +38,10 @@ def digest_of(*trees: Any) -> str:
 
 
 class Trainer:
-    """A network, its optimiser and the jitted step; the state is (network arrays, optimiser state)."""
+    """A network, its optimiser and the jitted step; the state is (network arrays, optimiser state).
+
+    learn: one step on given examples, clean and noisy, as `examples` makes them; returns what `step` does.
+    """
 
     def __init__(
         self,
@@ -55,8 +58,9 @@ class Trainer:
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        fixed = partial(_step, self.optimiser, perceptual, recipe.checkpoint, jitter, camera.sensor)
-        self._step = eqx.filter_jit(fixed, donate="none")
+        learn = partial(_learn, self.optimiser, perceptual, recipe.checkpoint)
+        self._step = eqx.filter_jit(partial(_step, learn, jitter, camera.sensor), donate="none")
+        self.learn = eqx.filter_jit(learn, donate="none")
 
     def start(self, seed: int) -> tuple[STLSTM, Any]:
         """The untrained network and its optimiser's state."""
@@ -85,9 +89,12 @@ def sharding_of_batches() -> jax.sharding.NamedSharding | None:
     return jax.sharding.NamedSharding(jax.sharding.Mesh(devices, "example"), jax.sharding.PartitionSpec("example"))
 
 
-def _step(optimiser, perceptual, checkpoint, jitter, sensor, state, batch, key, camera, noise, light):
+def _step(learn, jitter, sensor, state, batch, key, camera, noise, light):
+    return learn(state, *examples(batch, key, camera, noise, light, jitter, sensor))
+
+
+def _learn(optimiser, perceptual, checkpoint, state, clean, noisy):
     net, memory = state
-    clean, noisy = examples(batch, key, camera, noise, light, jitter, sensor)
 
     def value_of(net: STLSTM) -> jax.Array:
         enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
