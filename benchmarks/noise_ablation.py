@@ -251,6 +251,22 @@ def standard_error(means: Sequence[float]) -> float:
     return float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
 
 
+def judged(
+    sensor: Sensor, folds: Sequence[tuple[list[Clip], list[Clip]]], options
+) -> dict[str, list[dict[str, float]]]:
+    """PSNR of each clip, dB, in each fold, by the noise that the network was trained with."""
+    models = models_of(sensor, options.out)
+    camera = camera_of(sensor, models["paper"])
+    noises = {**models, REAL: sensor.fitted_darks, SHUFFLED: shuffled(sensor.fitted_darks)}
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in noises}
+    for seed, (train, kept) in enumerate(folds):
+        shown = [clip for clip in kept if not clip.is_long]
+        for name, noise in noises.items():
+            path = trained(camera, name, noise, train, seed, options)
+            found[name].append(measured(sensor, path, camera, shown, options.places))
+    return found
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -293,17 +309,7 @@ def main(argv: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, dict[str, list[dict[str, float]]]] = {}
     for name in asked:
-        sensor = known[name]()
-        models = models_of(sensor, options.out)
-        camera = camera_of(sensor, models["paper"])
-        noises = {**models, REAL: sensor.fitted_darks, SHUFFLED: shuffled(sensor.fitted_darks)}
-        of: dict[str, list[dict[str, float]]] = {name: [] for name in noises}
-        for seed, (train, kept) in enumerate(folds):
-            shown = [clip for clip in kept if not clip.is_long]
-            for noise_name, noise in noises.items():
-                path = trained(camera, noise_name, noise, train, seed, options)
-                of[noise_name].append(measured(sensor, path, camera, shown, options.places))
-        results[name] = of
+        results[name] = judged(known[name](), folds, options)
         sheet = table_of(results)
         Console(width=130).print(sheet.rich())
         write_atomically(options.out / "ablation.md", sheet.markdown().encode())
