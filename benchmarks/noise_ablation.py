@@ -37,6 +37,7 @@ from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
+from hsnoise.criticism.improve import improved
 from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
@@ -56,8 +57,8 @@ NEAR = 3.0  # standard deviations
 MATCH_SIDE = 256
 
 
-def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
-    """The four noise models, saved as files."""
+def models_of(sensor: Sensor, out: Path, minutes: float) -> dict[str, NoiseModel]:
+    """The four noise models, saved as files; minutes: of `improve`."""
     paths = {name: out / f"{sensor.name}-{name}.json" for name in NOISES}
     if not paths["paper"].exists():
         print(f"{sensor.name}: fitting")
@@ -72,7 +73,7 @@ def models_of(sensor: Sensor, out: Path) -> dict[str, NoiseModel]:
     if not paths["improved"].exists():
         print(f"{sensor.name}: improving")
         with busy("Fitting the first model") as say:
-            story = hsnoise.improve(sensor.fitted, progress=say)
+            story = improved(sensor.fitted, say, max_minutes=minutes)
         write_atomically(out / f"{sensor.name}-story.txt", f"{story}\n".encode())
         at_exposure(story.fit.params, sensor.exposure_s).save(paths["improved"])
     return {name: NoiseModel.load(path) for name, path in paths.items()}
@@ -255,7 +256,7 @@ def judged(
     sensor: Sensor, folds: Sequence[tuple[list[Clip], list[Clip]]], options
 ) -> dict[str, list[dict[str, float]]]:
     """PSNR of each clip, dB, in each fold, by the noise that the network was trained with."""
-    models = models_of(sensor, options.out)
+    models = models_of(sensor, options.out, options.minutes)
     camera = camera_of(sensor, models["paper"])
     noises = {**models, REAL: sensor.fitted_darks, SHUFFLED: shuffled(sensor.fitted_darks)}
     found: dict[str, list[dict[str, float]]] = {name: [] for name in noises}
@@ -273,6 +274,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
     add("--sensors", help="separated by commas")
     add("--seeds", type=int, help="trainings with each noise; each holds out different clips")
+    add("--minutes", type=float, help="of `improve`, for each sensor")
     add("--steps", type=int, help="steps of each training")
     add("--maps", type=int, help="feature maps of the network")
     add("--stride", type=int, help="side of a block of the network: 4 sees twice as far as 2")
@@ -295,6 +297,8 @@ def main(argv: list[str] | None = None) -> None:
         parser.error(f"--seeds: expected at least 2, because trainings scatter; got {options.seeds}")
     if not 0 <= options.jitter <= 1:
         parser.error(f"--jitter: expected 0 to 1, got {options.jitter:g}")
+    if not options.minutes > 0:
+        parser.error(f"--minutes: expected above 0, got {options.minutes:g}")
     for option in ("steps", "maps", "stride", "side", "places"):
         if getattr(options, option) < 1:
             parser.error(f"--{option}: expected at least 1, got {getattr(options, option)}")

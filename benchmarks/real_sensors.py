@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 import hsnoise
 from hsnoise.cli.progress import busy
+from hsnoise.criticism.improve import improved
 
 ROWS = 128  # rows that darks and flats of the IMX541 and STL-1001 share
 REPORTED_GAIN, REPORTED_READ_NOISE_E = 0.422149, 1.98
@@ -137,7 +138,7 @@ def improved(folder: Path, only: list[str]) -> None:
         print(f"\n{sensor}")
         stack = hsnoise.FrameStack(counts, exposure_s, white_level=white_level, shutter="global")
         with busy("Fitting the first model") as say:
-            story = hsnoise.improve(stack, progress=say)
+            story = improved(stack, say)
         print(story)
 
 
