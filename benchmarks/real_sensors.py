@@ -121,7 +121,7 @@ def stl1001(folder: Path) -> None:
         print(result)
 
 
-def improved(folder: Path, only: list[str]) -> None:
+def print_stories(folder: Path, only: list[str]) -> None:
     """Print the story of `hsnoise.improve` on the darks of each sensor, or of `only` these; for CCDs on a part."""
     stacks = {}
     data, about = captures(folder, "imx541_mono_emva")
@@ -177,7 +177,7 @@ def main() -> None:
         raise SystemExit(f"no captures in {folder}: set HSNOISE_SHARED to the folder that holds data/")
     if arguments.improve:
         a7s2(folder, arguments.figure.with_name("a7s2_dark_means.png"))
-        improved(folder, arguments.only)
+        print_stories(folder, arguments.only)
         return
     imx541(folder, arguments.figure)
     tc237(folder)
