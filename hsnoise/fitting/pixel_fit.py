@@ -16,7 +16,8 @@ import numpy as np
 
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
-from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, patterns_of, shadings_of, shortest_of
+from hsnoise.fitting.pixel_lines import Lines
+from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -56,6 +57,7 @@ class Channel:
         row_gain: variance of the row gain and its error.
         patterns: by effect, the variance that whole frames, rows or columns share without signal, DN^2, its standard
             error, and its chance deviation if there is none.
+        lines: by axis, static levels of rows and columns beside that drift.
         temporal_dn2: variance of the pixels themselves.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_spectrum: of what rows share in a frame.
@@ -78,6 +80,7 @@ class Channel:
     black_dn: tuple[float, float]
     row_gain: tuple[float, float]
     patterns: Mapping[str, tuple[float, float, float]]
+    lines: Mapping[str, Lines]
     temporal_dn2: float
     shading: Mapping[str, Shading]
     row_spectrum: RowSpectrum
@@ -154,6 +157,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
     shading = shadings_of(found, c, spectrum.widened)
+    lines = lines_in(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
@@ -168,7 +172,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         covariance=covariance,
         black_dn=black,
         row_gain=row_gain(values[2]),
-        patterns=patterns_of(found, c, shading),
+        patterns=patterns_of(found, c, shading, lines),
+        lines=lines,
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=spectrum,

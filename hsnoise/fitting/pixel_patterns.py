@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from hsnoise.fitting.pixel_lines import Lines, lines_of
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
 ALTERNATING = 0.45  # cycles per row
-MEDIAN_EFFICIENCY = 0.37  # of the median deviation, for normal values
+AXES = ("row", "column")
 PATTERNS = {
     "frame": "frame_offset",
     "row": "row_fixed_pattern",
@@ -69,35 +70,15 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
     return {} if largest is None else {largest: out[largest]}
 
 
-def _beside_the_shading(planes: Sequence[Plane], axis: str, shading: Shading, frames: int) -> tuple[float, float]:
-    """Static variance of the typical line beside a drift and its standard error, DN^2.
-
-    Lines lie off as a whole where the drift is steep or of another shape; others have a defect.
-    """
-    left, noise = [], []
-    for plane in planes:
-        left.append(_typical_dn2(shading.left_of(getattr(plane, f"{axis}_mean_dn"))))
-        over_frames = plane.components[f"{axis}_x_frame"].variance_dn2
-        noise.append(_noise_of_line_dn2(plane, axis) + max(over_frames, 0.0) / frames)
-    typical, lines = float(np.mean(left)), sum(len(getattr(plane, f"{axis}_mean_dn")) for plane in planes)
-    return typical - float(np.mean(noise)), typical * float(np.sqrt(2 / (MEDIAN_EFFICIENCY * lines)))
+def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, Lines]:
+    """Static rows and columns of a channel at the shortest dark exposure, by axis; empty without one."""
+    planes = shortest_of(found, c)
+    return {axis: lines_of(planes, axis, shading, found.shortest.n_frames) for axis in AXES} if planes else {}
 
 
-def _noise_of_line_dn2(plane: Plane, axis: str) -> float:
-    """What typical pixels, static and over time, scatter the static mean of a line, DN^2."""
-    level = plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
-    level -= np.median(level, axis=0)
-    level -= np.median(level, axis=1, keepdims=True)
-    across = plane.row_mean_dn if axis == "column" else plane.column_mean_dn
-    return _typical_dn2(level) / len(across)
-
-
-def _typical_dn2(values: np.ndarray) -> float:
-    """Variance of normal values with the same median deviation."""
-    return float((1.4826 * np.median(np.abs(values - np.median(values)))) ** 2)
-
-
-def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, tuple[float, float, float]]:
+def patterns_of(
+    found: Survey, c: int, shading: Mapping[str, Shading], lines: Mapping[str, Lines]
+) -> dict[str, tuple[float, float, float]]:
     """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
     planes, out = shortest_of(found, c), {}
     if not planes:
@@ -114,9 +95,9 @@ def patterns_of(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[s
         scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
-        if component in shading:
-            variance, error = _beside_the_shading(planes, component, shading[component], found.shortest.n_frames)
-            shared = replace(shared, variance_dn2=variance, standard_error_dn2=error)
+        if component in lines and (component in shading or lines[component].far):
+            of = lines[component]
+            shared = replace(shared, variance_dn2=of.variance_dn2, standard_error_dn2=of.error_dn2)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
         out[effect] = (

@@ -1,8 +1,9 @@
 """No number without a check: sentences on where a fit disagrees with its frames, and what is withheld.
 
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
-headers and the user (gain, black and white level, shutter, colours). `_choice`: which of two fits to believe. Here: a
-gain without growth of signal to support it, frames and pixels that measure nothing, and the order of all checks.
+headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
+`_choice`: which of two fits to believe. Here: a gain without growth of signal to support it, frames and pixels that
+measure nothing, and the order of all checks.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
+from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.flat_notes import gain_notes, scattered
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
@@ -65,12 +67,19 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_outliers(result),
         *_moved_pedestals(result),
         *_many_hot(result),
+        *curves(result),
         *_scattered_flats(result),
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
     if result.method == Method.TRANSFER:
-        notes = (*pixel_notes(result), *_of_neighbours(result), *_of_narrow(result, found), *_of_flats(result))
+        notes = (
+            *pixel_notes(result),
+            *defects(result),
+            *_of_neighbours(result),
+            *_of_narrow(result, found),
+            *_of_flats(result),
+        )
     notes = tuple(note for note in notes if note not in doubts)
     return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
 

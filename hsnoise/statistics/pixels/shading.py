@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-LENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # in widths of the frame; the last is a straight line
+LENGTHS = (*np.geomspace(0.01, 3.0, 20), 10.0)  # in widths of the frame; the last is a straight line
 LEAST_SHARE = 0.3  # of the variance of the means that a shading must explain
 THERE = 5.0  # standard errors
+NEIGHBOURS, FAR = 9, 6.0  # lines; typical deviations from their median beyond which a line has a defect
 
 
 class Shading(NamedTuple):
@@ -31,7 +33,8 @@ def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) ->
 
     noise_dn: standard error of each mean; chance_dn: rms of a shading that noise of lines makes in these means.
     """
-    y = means_dn - means_dn.mean()
+    y = _without_defects(means_dn)
+    y -= y.mean()
     best = None
     for start in ("first", "last"):
         for length in LENGTHS:
@@ -45,6 +48,13 @@ def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) ->
     if abs(size) < THERE * error or size**2 < LEAST_SHARE * float((y**2).mean()):
         return None
     return Shading(abs(size), error, length, start, size > 0)
+
+
+def _without_defects(means_dn: np.ndarray) -> np.ndarray:
+    """Means of lines [n], DN, those far off their neighbours replaced by these."""
+    around = median_filter(means_dn, NEIGHBOURS, mode="nearest")
+    off = np.abs(means_dn - around)
+    return np.where(off > FAR * 1.4826 * np.median(off), around, means_dn)
 
 
 def _shape(lines: int, start: str, length: float) -> np.ndarray:

@@ -1,0 +1,77 @@
+"""Static levels of whole rows and columns: those of the many, those that lie far off, and what neighbours share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise.statistics.pixels.shading import Shading
+from hsnoise.statistics.pixels.survey import Plane
+
+FAR = 6.0  # typical deviations beyond which a line has a defect
+FEW = 0.05  # share of lines with a defect; of more, levels have two or three values, as bands leave them
+EFFICIENCY = 2 / 3  # of differences of neighbours, which overlap
+ALIKE, BEYOND_CHANCE = 0.5, 5.0  # share of the variance, and its errors, that neighbours have in common
+
+
+class Lines(NamedTuple):
+    """Static levels of the lines of one axis, beside a drift.
+
+    Attributes:
+        variance_dn2, error_dn2: of the lines that do not lie far off, noise of estimation taken off, and its error.
+        next_dn2: half the mean square by which a line differs from the next, the same noise taken off: all of the
+            variance if each line has a level of its own, little of it if they follow a curve.
+        follow: whether they follow a curve beyond chance.
+        far, farthest_dn: how many lie far off, and by how much at most, DN.
+    """
+
+    variance_dn2: float
+    error_dn2: float
+    next_dn2: float
+    follow: bool
+    far: int
+    farthest_dn: float
+
+
+def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading], frames: int) -> Lines:
+    """The static lines of an axis ("row" or "column") in the planes of one channel, means over so many frames."""
+    rest = [_rest(getattr(plane, f"{axis}_mean_dn"), shading.get(axis)) for plane in planes]
+    near = [_near(of) for of in rest]
+    noise = float(np.mean([_noise_dn2(plane, axis, frames) for plane in planes]))
+    variance = float(np.mean([of[there].var(ddof=1) for of, there in zip(rest, near, strict=True)]))
+    steps = [np.diff(of)[there[1:] & there[:-1]] for of, there in zip(rest, near, strict=True)]
+    beside = float(np.mean([0.5 * np.mean(of**2) for of in steps]))
+    lines = sum(map(len, rest))
+    error, of_beside = variance * np.sqrt(2 / lines), beside * np.sqrt(2 / (EFFICIENCY * lines))
+    shared = variance - beside
+    follow = shared > max(ALIKE * (variance - noise), BEYOND_CHANCE * float(np.hypot(error, of_beside)))
+    far = [np.abs(of[~there]) for of, there in zip(rest, near, strict=True)]
+    farthest = max((float(of.max()) for of in far if len(of)), default=0.0)
+    return Lines(variance - noise, float(error), beside - noise, bool(follow), sum(map(len, far)), farthest)
+
+
+def _near(rest_dn: np.ndarray) -> np.ndarray:
+    near = np.abs(rest_dn) <= FAR * _typical_dn(rest_dn)
+    return near if near.mean() >= 1 - FEW else np.ones_like(near)
+
+
+def _rest(means_dn: np.ndarray, shading: Shading | None) -> np.ndarray:
+    rest = means_dn if shading is None else shading.left_of(means_dn)
+    return rest - np.median(rest)
+
+
+def _noise_dn2(plane: Plane, axis: str, frames: int) -> float:
+    """What typical pixels, static and over time, and lines over time scatter the static mean of a line, DN^2."""
+    level = plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
+    level -= np.median(level, axis=0)
+    level -= np.median(level, axis=1, keepdims=True)
+    across = plane.row_mean_dn if axis == "column" else plane.column_mean_dn
+    over_time = max(plane.components[f"{axis}_x_frame"].variance_dn2, 0.0)
+    return _typical_dn(level) ** 2 / len(across) + over_time / frames
+
+
+def _typical_dn(values: np.ndarray) -> float:
+    """Standard deviation of normal values with the same median deviation."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))

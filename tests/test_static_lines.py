@@ -1,0 +1,69 @@
+"""Fixed levels of columns: a pattern of each by itself, a drift of the black level, curves and defects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+from hsnoise._core.conclusion import Light
+
+SHAPE, EXPOSURES_S, GAIN, READ_E = (96, 160), (0.1, 1.0, 4.0, 10.0), 0.5, 4.0
+COLUMN = np.arange(SHAPE[1]) / SHAPE[1]
+CURVES_DN = {
+    "none": 0 * COLUMN,
+    "edge": 6 * np.exp(-COLUMN / 0.012),
+    "drift": 6 * np.exp(-COLUMN / 0.075),
+    "line": 6 * COLUMN,
+    "step": 6 * (COLUMN > 0.5),
+    "parabola": 24 * (COLUMN - 0.5) ** 2,
+    "two drifts": 6 * (np.exp(-COLUMN / 0.02) + 0.5 * np.exp(-COLUMN / 0.25)),
+}
+
+
+def darks(curve: str, pattern_e: float, defects: int = 0, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    rate = rng.lognormal(np.log(3), 0.6, SHAPE)
+    offset = CURVES_DN[curve] + GAIN * pattern_e * rng.standard_normal(SHAPE[1])
+    offset[rng.choice(SHAPE[1], defects, replace=False)] += 40.0
+    frames = [
+        rng.poisson(rate * t, (4, *SHAPE)) + READ_E * rng.standard_normal((4, *SHAPE)) + offset / GAIN
+        for t in EXPOSURES_S
+    ]
+    return np.rint(200 + GAIN * np.stack(frames)).astype(np.uint16)
+
+
+def fitted(*what) -> hsnoise.FitResult:
+    return hsnoise.fit(darks(*what), exposure_s=EXPOSURES_S)
+
+
+def told(sentences: tuple[str, ...], what: str) -> bool:
+    return any(what in sentence for sentence in sentences)
+
+
+@pytest.mark.parametrize("pattern_e", [0.0, 0.4])
+@pytest.mark.parametrize("curve", ["none", "edge", "drift", "line"])
+def test_columns_are_measured_beside_a_drift(curve, pattern_e):
+    found = fitted(curve, pattern_e)
+    sigma, error, _ = found.table.get("column_fixed_pattern.sigma", (0.0, 0.1, "e-"))
+    assert abs(sigma - pattern_e) < 4 * error and error < 0.15
+    assert ("black_shading" in found.added) == (curve != "none")
+    assert found.conclusion.light == Light.GREEN and not told(found.doubts, "curve")
+
+
+@pytest.mark.parametrize("curve", ["step", "parabola", "two drifts"])
+def test_a_curve_that_no_drift_describes_is_a_doubt(curve):
+    """It is drawn as columns, because that is the nearest, and green would say that it is right."""
+    found = fitted(curve, 0.2)
+    assert "column_fixed_pattern" in found.added
+    assert found.conclusion.light == Light.AMBER and told(found.doubts, "The fixed levels of columns differ by")
+    gain, error, _ = found.table["gain"]
+    assert abs(gain - GAIN) < 4 * error
+
+
+@pytest.mark.parametrize("curve", ["none", "line"])
+def test_columns_with_a_defect_are_no_pattern_of_all(curve):
+    found = fitted(curve, 0.4, 3)
+    sigma, error, _ = found.table["column_fixed_pattern.sigma"]
+    assert abs(sigma - 0.4) < 4 * error
+    assert told(found.notes, "3 columns lie far off the others in all frames, by up to 4")
