@@ -110,6 +110,15 @@ def test_exposures_that_are_swapped(rng):
     assert "are their exposures swapped?" in findings([darks(rng, 30), darks(rng, 1)], [1, 30])
 
 
+def test_flats_alone_make_no_fit_without_a_black_level(rng):
+    lit = {"counts": [flats(rng, mean) for mean in (300, 600)], "exposure_s": [1, 2], "kind": "flat"}
+    found = hsnoise.inspect(FrameStack(**lit))
+    assert not found.fit_makes_sense and "flats alone" in found.verdict
+    with pytest.raises(ValueError, match="flats alone"):
+        hsnoise.fit(FrameStack(**lit))
+    assert hsnoise.inspect(FrameStack(**lit, black_level=BLACK_DN)).fit_makes_sense
+
+
 def test_a_group_of_averages(rng):
     mean_of_nine = darks(rng, 8, 72).reshape(9, 8, *SHAPE).mean(0).round().astype(np.uint16)
     said = findings([darks(rng, 0), darks(rng, 4), mean_of_nine], [0, 4, 8])
@@ -136,7 +145,7 @@ def test_lines_that_move_together_are_no_read_noise_of_pixels(rng, axis, lines, 
     found = hsnoise.inspect(counts, exposure_s=[0])
     (read_noise,) = (said for said in found.determined if said.startswith("Read noise"))
     assert f"DN shared by {lines.lower()}" in read_noise
-    pixel = float(read_noise.split("of which ")[1].split()[0])
+    pixel = float(read_noise.split(" s is ")[1].split()[0])
     assert pixel == pytest.approx(GAIN * READ_E, rel=0.03)
     assert odd == any(said.startswith(f"{lines} of the shortest darks change") for said in found.findings)
 

@@ -192,7 +192,7 @@ def test_a_split_in_a_file_takes_videos_with_all_their_cuts(tmp_path):
         ('training = ["a"]\nvalidation = ["b"]\ntest = ["x", "y"]', "names x, y, of which --clips has no clip"),
         ('training = ["a"]\nvalidation = ["b"]', "expected the lists training, validation, test"),
         ('training = ["a"]\nvalidation = []\ntest = ["b"]', "names of videos in validation"),
-        ("training = [", "cannot be read"),
+        ("training = [", "expected a TOML file"),
     ],
 )
 def test_a_wrong_split_is_refused(tmp_path, text, words):

@@ -117,11 +117,11 @@ def _noises(group: GroupFacts) -> Iterator[str]:
     if len(group.frames) < 3:
         return
     for frame in group.frames:
-        ratio = frame.noise_dn / max(group.temporal_dn, 1e-6)
+        ratio, name = frame.noise_dn / max(group.temporal_dn, 1e-6), f"{frame.name} ({group.name})"
         if ratio < QUIETER:
-            yield f"{frame.name} ({group.name}) has {ratio:.2f} times the noise of the others: an average of frames?"
+            yield f"{name} has {ratio:.2f} times the noise of the others: an average of frames?"
         elif ratio > NOISIER:
-            yield f"{frame.name} ({group.name}) has {ratio:.1f} times the noise of the others: another gain, or light?"
+            yield f"{name} has {ratio:.1f} times the noise of the others: another gain, light, or bands?"
 
 
 def _order(groups: Sequence[GroupFacts]) -> Iterator[str]:

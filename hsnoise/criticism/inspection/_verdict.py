@@ -32,13 +32,19 @@ class Judgement:
 
 
 def judged(
-    facts: Facts, elsewhere: Facts | None, budget: NoiseBudget | None, gain: Gain | None, is_mosaic: bool
+    facts: Facts,
+    elsewhere: Facts | None,
+    budget: NoiseBudget | None,
+    gain: Gain | None,
+    *,
+    is_mosaic: bool,
+    knows_black: bool,
 ) -> Judgement:
-    """What can be determined from these frames."""
+    """What can be determined from these frames; knows_black: whether the black level is given."""
     darks = [group for group in facts.groups if group.kind == "dark"]
     flats = [group for one in (facts, elsewhere) if one is not None for group in one.groups if group.kind == "flat"]
     repeated = [group for group in darks if group.n_frames > 1]
-    against = _against_a_fit(facts, darks, flats, repeated, is_mosaic)
+    against = _against_a_fit(facts, darks, flats, repeated, is_mosaic=is_mosaic, knows_black=knows_black)
     relative = growth_error(budget)
     determined = (
         _gain_sentence(gain, flats, relative, repeated),
@@ -116,7 +122,9 @@ def _against_a_fit(
     darks: Sequence[GroupFacts],
     flats: Sequence[GroupFacts],
     repeated: Sequence[GroupFacts],
+    *,
     is_mosaic: bool,
+    knows_black: bool,
 ) -> tuple[str, str] | None:
     """Why a fit makes no sense, and what to do; None if it does."""
     if not facts.groups:
@@ -128,6 +136,11 @@ def _against_a_fit(
         )
     if not darks and not flats:
         return "there are neither darks nor flats", "Darks of several exposures, eight frames of each."
+    if not darks and not knows_black:
+        return (
+            "flats alone cannot separate the black level from the read noise",
+            f"Eight bias frames or short darks at the same gain; or {setting('black_level', 200)}, if you know it.",
+        )
     clipped = [g for g in darks if np.mean([frame.clipped_share for frame in g.frames]) > MOSTLY_CLIPPED]
     if darks and len(clipped) == len(darks):
         return (
@@ -155,7 +168,11 @@ def _gain_sentence(gain: Gain | None, flats: Sequence[GroupFacts], relative: flo
     if relative < ROUGH:
         return f"Gain: roughly, from the growth of the noise of darks, to about {100 * relative:.0f} % at best"
     why = "the noise of the darks does not grow with exposure" if len(repeated) > 1 else "there is nothing to compare"
-    return f"Gain: no; there are no flats in pairs, and {why}"
+    if not any(group.n_frames > 1 for group in flats):
+        of_flats = "there are no flats in pairs"
+    else:
+        of_flats = "the flats do not show it" if repeated else "there are no repeated darks beside the flats"
+    return f"Gain: no; {of_flats}, and {why}"
 
 
 def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool, budget: NoiseBudget | None) -> str:
@@ -164,9 +181,11 @@ def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool, budget:
     first = min(repeated, key=lambda group: group.exposure_s)
     unit = "in DN and in electrons" if has_gain else "in DN only, since the gain is unknown"
     parts = _shared_noise(budget)
-    rest = "".join(f", {noise:.3g} DN shared by {what}" for what, noise in parts[1].items()) if parts else ""
-    of_which = f", of which {parts[0]:.3g} DN of single pixels{rest}" if parts and rest else ""
-    return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN{of_which}"
+    if parts is None or not parts[1]:
+        return f"Read noise: yes, {unit}; the noise of the {first.name} is {first.temporal_dn:.3g} DN"
+    pixel, shared = parts
+    rest = " and ".join(f"{noise:.3g} DN shared by {what}" for what, noise in shared.items())
+    return f"Read noise: yes, {unit}; the noise of the {first.name} is {pixel:.3g} DN of single pixels, beside {rest}"
 
 
 def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> str:
@@ -181,7 +200,7 @@ def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> s
     if last.level_dn <= first.level_dn:
         return "Dark current: only what the camera does not subtract; the mean does not rise"
     rise = (last.level_dn - first.level_dn) / (last.exposure_s - first.exposure_s)
-    return f"Dark current: yes; most pixels rise by about {rise:.2g} DN/s"
+    return f"Dark current: yes; the level rises by about {rise:.2g} DN/s"
 
 
 def _next_capture(

@@ -124,7 +124,7 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
         gain = gain_of_flats(main_budget, other_budget, elsewhere)
     groups = facts.groups + (elsewhere.groups if elsewhere is not None else ())
     is_mosaic = any(group.mosaic for group in groups)
-    found = judged(facts, elsewhere, main_budget, gain, is_mosaic)
+    found = judged(facts, elsewhere, main_budget, gain, is_mosaic=is_mosaic, knows_black=stack.black_level is not None)
     findings = [
         *odd_frames(facts),
         *(odd_frames(elsewhere) if elsewhere is not None else []),

@@ -86,7 +86,7 @@ def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: 
     names, digests = (set(map(source_of, about.get("clips", ()))), about.get("trained_on", ()))
     seen = sorted({clip.source for clip in scored if clip.source in names or digest_of(clip.frames) in digests})
     if seen:
-        raise ValueError(f"--clips: {', '.join(seen)} would be scored, but {path} was trained on them")
+        raise ValueError(f"--clips: expected clips that {path} was not trained on, got {', '.join(seen)}")
 
 
 def note_protocol(path: Path, about: dict) -> None:

@@ -95,7 +95,8 @@ def checked_light(option: str, light: tuple[float, float]) -> tuple[float, float
     """`light`; raises ValueError unless it is a plausible range."""
     low, high = light
     if not LEAST_LIGHT <= low <= high <= MOST_LIGHT:
-        raise ValueError(f"{option}: expected low,high from {LEAST_LIGHT:g} to {MOST_LIGHT:g}, got {low:g},{high:g}")
+        allowed = f"low,high, the low one first, from {LEAST_LIGHT:g} to {MOST_LIGHT:g}"
+        raise ValueError(f"{option}: expected {allowed}, got {low:g},{high:g}")
     return light
 
 

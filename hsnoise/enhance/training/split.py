@@ -46,8 +46,10 @@ def split_of(clips: Sequence[Clip], path: Path | None) -> Split:
 def _lists(path: Path) -> dict[str, list[str]]:
     try:
         lists = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:  # tomllib's error is a ValueError, as is that of wrong bytes
-        raise ValueError(f"--split: {path} cannot be read ({error})") from error
+    except OSError as error:
+        raise ValueError(f"--split: {path}: {error.strerror}") from error
+    except ValueError as error:  # tomllib's, or that of wrong bytes
+        raise ValueError(f"--split: expected a TOML file, got {path} ({error})") from error
     if set(lists) != set(LISTS):
         raise ValueError(f"--split: expected the lists {', '.join(LISTS)} in {path}, got {', '.join(lists) or 'none'}")
     for name, videos in lists.items():
