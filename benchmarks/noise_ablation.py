@@ -315,7 +315,7 @@ def main(argv: list[str] | None = None) -> None:
     for name in asked:
         results[name] = judged(known[name](), folds, options)
         sheet = table_of(results)
-        Console(width=130).print(sheet.rich())
+        Console(width=180).print(sheet.rich())
         write_atomically(options.out / "ablation.md", sheet.markdown().encode())
         write_atomically(options.out / "ablation.json", json.dumps(results).encode())
 
