@@ -71,7 +71,9 @@ def test_published_sizes(name, channels):
     assert sum(math.prod(leaf.shape) for leaf in leaves) == PARAMETERS[name, channels]
 
 
-@pytest.mark.parametrize("name", ["KPN", "TOFlow", "FastDVDnet", pytest.param("FFDNet", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["FastDVDnet", *(pytest.param(n, marks=pytest.mark.slow) for n in ("FFDNet", "KPN", "TOFlow"))]
+)
 def test_steps_down_a_finite_slope_lower_the_loss(name):
     net, (noisy, clean) = small(name), scene(side=16)
     of_loss = eqx.filter_jit(eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, jnp.float32(0.5))))
@@ -122,6 +124,7 @@ def test_noise_of_display_values_follows_the_curve():
     np.testing.assert_allclose(displayed_with_noise(light, noise)[1].reshape(-1), 1e-3 * slope, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_ffdnet_trusts_a_frame_less_where_the_map_says_more_noise():
     """Flat frames, each with an error of its own: the best output is nearer to the mean of all, the larger the noise.
 

@@ -41,8 +41,15 @@ def told(sentences: tuple[str, ...], what: str) -> bool:
     return any(what in sentence for sentence in sentences)
 
 
-@pytest.mark.parametrize("pattern_e", [0.0, 0.4])
-@pytest.mark.parametrize("curve", ["none", "edge", "drift", "line"])
+@pytest.mark.parametrize(
+    ("curve", "pattern_e"),
+    [
+        ("none", 0.4),
+        ("drift", 0.0),
+        ("drift", 0.4),
+        *(pytest.param(curve, size, marks=pytest.mark.slow) for curve in ("edge", "line") for size in (0.0, 0.4)),
+    ],
+)
 def test_columns_are_measured_beside_a_drift(curve, pattern_e):
     found = fitted(curve, pattern_e)
     sigma, error, _ = found.table.get("column_fixed_pattern.sigma", (0.0, 0.1, "e-"))
@@ -51,7 +58,9 @@ def test_columns_are_measured_beside_a_drift(curve, pattern_e):
     assert found.conclusion.light == Light.GREEN and not told(found.doubts, "curve")
 
 
-@pytest.mark.parametrize("curve", ["step", "parabola", "two drifts"])
+@pytest.mark.parametrize(
+    "curve", ["two drifts", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("step", "parabola"))]
+)
 def test_a_curve_that_no_drift_describes_is_a_doubt(curve):
     """It is drawn as columns, because that is the nearest, and green would say that it is right."""
     found = fitted(curve, 0.2)
@@ -61,7 +70,7 @@ def test_a_curve_that_no_drift_describes_is_a_doubt(curve):
     assert abs(gain - GAIN) < 4 * error
 
 
-@pytest.mark.parametrize("curve", ["none", "line"])
+@pytest.mark.parametrize("curve", [pytest.param("none", marks=pytest.mark.slow), "line"])
 def test_columns_with_a_defect_are_no_pattern_of_all(curve):
     found = fitted(curve, 0.4, 3)
     sigma, error, _ = found.table["column_fixed_pattern.sigma"]
