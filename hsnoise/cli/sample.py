@@ -98,6 +98,10 @@ def _told(path: Path, counts: np.ndarray, metadata: dict[str, Any]) -> list[str]
     ]
     if metadata["kind"] == "flat":
         lines.append('kind "flat": a picture of light, with dark current added; not dark frames')
+    if "white_level" not in metadata and counts.max() > np.iinfo(np.uint16).max:
+        lines.append(
+            "The model has no white level, so counts exceed 16 bits: fit with --white-level, as the camera has"
+        )
     held = HELD.get(path.suffix.lower(), tuple(metadata))
     lines.append(f"Beside the counts the file holds {', '.join(held)}" if held else "The file holds counts only")
     return [*lines, f"In Python: {_reading(path, n * frames, metadata, held)}"]

@@ -31,6 +31,7 @@ ENDED_IN_SHORT = {
     Ended.STEPS: "It stopped after {limit}; something may be left",
     Ended.UNFINISHED: "Not finished",
 }
+NEGLIGIBLE = 1e-3  # of the variance: a component that is off by less is not told
 UNITS = {Ended.MINUTES: "minute", Ended.STEPS: "addition"}  # of a limit
 REFUSED = {
     Refused.NOT_FITTED: "could not be fitted",
@@ -70,6 +71,10 @@ def unexplained(worst: Share | None) -> str:
     does = "lacks" if worst.off_dn < 0 else "adds"
     where = seconds(worst.exposure_s) + ("" if worst.channel == "mono" else f", {worst.channel}")
     share = worst.unexplained_of_total
+    if share < NEGLIGIBLE:
+        return (
+            f"no component of the noise budget of the darks is off by more than {100 * NEGLIGIBLE:g} % of the variance"
+        )
     much = f"{100 * share:.2g} %" if share < 1 else f"{number(share)} times"
     return (
         f"the noise budget of the darks differs most in {worst.in_words} ({where}): the model {does}"
@@ -330,7 +335,7 @@ def frames_apart(fitted: Sequence[int], held_out: Sequence[int]) -> str:
     return (
         f"The first {_span(fitted)} dark frames of each exposure were fitted and compared. held-out: log-likelihood of"
         f" the statistics of the other {_span(held_out)}, in nats (one more: 2.7 times as probable). To fit all frames:"
-        " hsnoise.fit(stack, model=story.fit.params), or hsnoise fit --model model.json (closed: named.json)."
+        " hsnoise.fit(stack, model=story.fit.params), or hsnoise fit --model model.json (named.json of a closed model)."
     )
 
 

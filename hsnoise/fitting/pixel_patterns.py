@@ -15,6 +15,7 @@ from hsnoise.statistics.pixels.survey import Plane, Survey
 
 ALTERNATING = 0.45  # cycles per row
 AXES = ("row", "column")
+CERTAIN = 10.0  # standard errors of a drift
 PATTERNS = {
     "frame": "frame_offset",
     "row": "row_fixed_pattern",
@@ -51,7 +52,7 @@ def known_of_rows(found: Survey, c: int, apart: int = 0) -> float:
 
 
 def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shading]:
-    """The drift of the black level along the rows or down the frame, whichever is larger: a model has one.
+    """The drift of the black level along the rows or down the frame: a model has one.
 
     widened: as in `RowSpectrum`; slow row noise drifts, too, and a few frames do not average it out.
     """
@@ -66,8 +67,14 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
             chance = np.sqrt(max(of_lines_dn2, 0.0) / found.shortest.n_frames * slow)
             one = shading_of(means, float(noise), float(chance))
             out |= {} if one is None else {axis: one}
-    largest = max(out, key=lambda axis: out[axis].amplitude_dn, default=None)
+    # The larger of two that are certain; else the more certain, which a few frames less still show.
+    certain = {axis: one for axis, one in out.items() if one.amplitude_dn > CERTAIN * one.error_dn}
+    largest = max(certain or out, key=lambda axis: _rank(out[axis], bool(certain)), default=None)
     return {} if largest is None else {largest: out[largest]}
+
+
+def _rank(one: Shading, by_size: bool) -> float:
+    return one.amplitude_dn if by_size else one.amplitude_dn / one.error_dn
 
 
 def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, Lines]:

@@ -26,6 +26,7 @@ from hsnoise.likelihood.summary import Summary, without_counts
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.maps import PixelMaps, pixel_maps
 
+BASE = ("gain", "read_noise", "dark_current", "black_level")  # printed first
 MOST_ERROR_DN = 1e5  # of a value that is shown: beyond, nothing is known of it
 
 
@@ -208,8 +209,13 @@ class FitResult:
 
     @property
     def shown(self) -> dict[str, tuple[float, float, str]]:
-        """The rows of `table` as they are printed: without a gain, single pixels still tell electrons as DN."""
-        rows = self.table
+        """The rows of `table` as they are printed: what every camera has first, and so on a screen that is cut.
+
+        Without a gain, single pixels still tell electrons as DN.
+        """
+        table = self.table
+        first = [name for base in BASE if base in self.params for name in self.rows_of(base)]
+        rows = {name: table[name] for name in dict.fromkeys([*first, *table])}
         if self.has_gain or self.transfer is None:
             return rows
         in_e = [name for name in self.withheld if name in rows and rows[name][2] in ("e-", "e-/s")]
