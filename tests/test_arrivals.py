@@ -121,7 +121,7 @@ SQUARES = {  # of x = gain (Poisson(light + rate t) + sigma z) + black: paramete
 }
 
 
-SOME = ["rate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gain", "sigma", "light"))]
+SOME = ["rate", "gain", "sigma", "light"]
 
 
 @pytest.mark.slow
@@ -141,6 +141,7 @@ def test_gradient_of_an_expectation_is_that_of_its_closed_form(name):
     assert error < 0.01 * abs(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_gradient_through_rounding_and_clipping(name):
     """Against finite differences of the exact expectation of counts clipped at 0 and 12."""

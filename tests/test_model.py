@@ -54,7 +54,8 @@ class LampRipple(AbstractEffect):
         return signal * jnp.maximum(1 + self.sigma * ripple, 0)
 
 
-@pytest.mark.parametrize("light", [pytest.param(0.0, marks=pytest.mark.slow), 30.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [0.0, 30.0])
 def test_effects_in_one_program_draw_what_each_draws(light):
     model = canon_5d3(black_level_dn=100)
     for effect in (RowNoise(0.7), HotPixels(0.02, 90.0), Crosstalk(0.02), HeavyTailedReadNoise(5.0)):

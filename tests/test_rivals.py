@@ -71,9 +71,8 @@ def test_published_sizes(name, channels):
     assert sum(math.prod(leaf.shape) for leaf in leaves) == PARAMETERS[name, channels]
 
 
-@pytest.mark.parametrize(
-    "name", ["FastDVDnet", *(pytest.param(n, marks=pytest.mark.slow) for n in ("FFDNet", "KPN", "TOFlow"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RIVALS)
 def test_steps_down_a_finite_slope_lower_the_loss(name):
     net, (noisy, clean) = small(name), scene(side=16)
     of_loss = eqx.filter_jit(eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, jnp.float32(0.5))))

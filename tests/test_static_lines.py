@@ -45,9 +45,9 @@ def told(sentences: tuple[str, ...], what: str) -> bool:
     ("curve", "pattern_e"),
     [
         ("none", 0.4),
-        ("drift", 0.0),
         ("drift", 0.4),
         *(pytest.param(curve, size, marks=pytest.mark.slow) for curve in ("edge", "line") for size in (0.0, 0.4)),
+        pytest.param("drift", 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_columns_are_measured_beside_a_drift(curve, pattern_e):

@@ -74,7 +74,7 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
 
 
 def _rank(one: Shading, by_size: bool) -> float:
-    return one.amplitude_dn if by_size else one.amplitude_dn / one.error_dn
+    return one.amplitude_dn if by_size else one.amplitude_dn / max(one.error_dn, 1e-12)
 
 
 def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, Lines]:

@@ -30,6 +30,6 @@ def of_fit(fit) -> dict[str, Figure]:
         "row_spectrum": (row_spectrum, has_row_spectrum(fit)),
         "pixel_transfer": (pixel_transfer, fit.has_gain and bool(transfers_of(fit))),
         "dark_current": (dark_current, fit.has_gain and bool(transfers_of(fit))),
-        "pixel_map": (pixel_map, conditional and max(fit.summary.n_frames, default=0) > 1),
+        "pixel_map": (pixel_map, conditional and max(fit.summary.n_frames, default=0) > 1 and fit.pixels.flags.any()),
     }
     return {name: draw(fit) for name, (draw, there) in drawings.items() if there}

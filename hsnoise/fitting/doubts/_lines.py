@@ -10,7 +10,7 @@ from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.result import FitResult
 
-NOTABLE = 0.01  # of the temporal variance of pixels: less of a curve changes no frame visibly
+NOTABLE = 0.01  # of the temporal variance of pixels: less changes no frame visibly
 
 
 def curves(result: FitResult) -> Iterator[str]:
@@ -31,10 +31,9 @@ def curves(result: FitResult) -> Iterator[str]:
 def defects(result: FitResult) -> Iterator[str]:
     """Lines that lie far off, which no effect draws."""
     for axis in AXES:
-        found = [one for one, _ in _lines(result, axis)]
-        far = max((one.far for one in found), default=0)
-        if far:
-            farthest = max(one.farthest_dn for one in found)
+        found = [one for one, dn2 in _lines(result, axis) if one.far and one.farthest_dn**2 > NOTABLE * dn2]
+        if found:
+            far, farthest = max(one.far for one in found), max(one.farthest_dn for one in found)
             lines, are = (f"{far} {axis}s lie", "are") if far > 1 else (f"One {axis} lies", "is")
             yield (
                 f"{lines} far off the others in all frames, by up to {farthest:.2g} DN, and {are} in no effect:"
