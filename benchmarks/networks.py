@@ -1,6 +1,7 @@
 """The ST-LSTM against published networks, trained alike: PSNR and SSIM on held-out clips.
 
     python -m benchmarks.networks --clips FOLDER --minutes 10 --camera canon_5d3 --out build/networks
+    python -m benchmarks.networks --clips FOLDER --untrained
 
 Every network sees the same noise and the same pieces of the same clips in the same order, for the same time of training
 (without compilation; or the same number of steps, `--steps`). Its learning rate falls by a cosine from the best of
@@ -43,6 +44,7 @@ from hsnoise._core.sheet import Sheet
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
+from hsnoise.enhance.training.rivals import Denoiser, denoised, rivals, tuned
 from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
@@ -199,11 +201,23 @@ def best_rate(setting: Setting, name: str, budget: Budget, rates: Sequence[float
     return max(rates, key=lambda rate: found[rate] if np.isfinite(found[rate]) else -np.inf)
 
 
-def tested(net: Any, scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
-    """Scores of each video, means over levels of light."""
+def _of_scene(net: Any, scene: Scene) -> np.ndarray:
+    return np.asarray(_enhanced(net, scene.noisy))
+
+
+def prepared(setting: Setting, name: str, denoise: Denoiser, crop: int) -> Callable[[Scene], np.ndarray]:
+    """A method that is not trained, with the strength and domain that do best on the first validation clip."""
+    mean_e = middle_of(setting.camera.mean_e)
+    strength, domain = tuned(denoise, scene_of(setting.validation[0], setting.camera, mean_e, crop, 99, TESTED_FRAMES))
+    print(f"{name}: best at {strength:g} times the noise in {domain}", flush=True)
+    return partial(denoised, denoise, strength=strength, domain=domain)
+
+
+def tested(method: Callable[[Scene], np.ndarray], scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
+    """Scores of each video, means over levels of light. method: display values of a scene."""
     found: dict[str, list[dict[str, float]]] = {}
     for scene in scenes:
-        found.setdefault(scene.clip, []).append(scores_of(np.asarray(_enhanced(net, scene.noisy)), scene))
+        found.setdefault(scene.clip, []).append(scores_of(method(scene), scene))
     return {
         clip: {what: float(np.mean([of[what] for of in all_of])) for what in SCORES} for clip, all_of in found.items()
     }
@@ -223,10 +237,12 @@ def tables(results: dict[str, dict]) -> list[Sheet]:
         apart = {w: [of[c][w] - (results[less]["clips"][c][w] if less else 0.0) for c in of] for w in SCORES}
         return tuple(with_error(values, digits[what], "+" if less else "") for what, values in apart.items())
 
-    own = [
-        (name, f"{of['parameters']:,}", f"{of['steps']:,}", f"{of['minutes']:.1f}", f"{of['rate']:g}", *row(name))
-        for name, of in results.items()
-    ]
+    def about(of: dict) -> tuple[str, ...]:
+        if "parameters" not in of:  # of a method that is not trained
+            return "", "", "", ""
+        return f"{of['parameters']:,}", f"{of['steps']:,}", f"{of['minutes']:.1f}", f"{of['rate']:g}"
+
+    own = [(name, *about(of), *row(name)) for name, of in results.items()]
     less = [(f"{OURS} - {name}", *row(OURS, name)) for name in results if name != OURS and OURS in results]
     first = ("network", "parameters", "steps", "minutes", "rate", *heads)
     sheets = Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *heads), less)
@@ -247,6 +263,40 @@ def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     return Setting(camera, model, noise, training, validation, options.width, options.out, digest), test
 
 
+def measures(
+    setting: Setting, scenes: Sequence[Scene], options: argparse.Namespace
+) -> dict[str, Callable[[], dict[str, Any]]]:
+    """By name of a method, what trains or tunes it if need be and gives its scores; those in `--out` are read."""
+    budget = Budget(None if options.steps else options.minutes, options.steps)
+
+    def of_network(name: str) -> dict[str, Any]:
+        rate = best_rate(setting, name, budget, options.rates, options.crop)
+        net, about = trained(setting, name, rate, budget)
+        return about | {"clips": tested(partial(_of_scene, net), scenes)}
+
+    def of_untrained(name: str, denoise: Denoiser) -> dict[str, Any]:
+        return {"clips": tested(prepared(setting, name, denoise, options.crop), scenes)}
+
+    rates = "-".join(f"{rate:g}" for rate in options.rates)
+    found = {
+        name: partial(
+            kept, setting.out / f"{named(setting, name, budget)}-{rates}-{options.crop}.json", of_network, name
+        )
+        for name in options.networks
+    }
+    for name, denoise in rivals().items() if options.untrained else ():
+        path = setting.out / f"{name.replace(' ', '-')}-{setting.digest}-{options.crop}.json"
+        found[name] = partial(kept, path, of_untrained, name, denoise)
+    return found
+
+
+def kept(path: Path, measure: Callable[..., dict[str, Any]], *what: Any) -> dict[str, Any]:
+    """What stands in a file, or else what is measured, and then stands there."""
+    if not path.exists():
+        write_atomically(path, json.dumps(measure(*what), indent=1).encode())
+    return json.loads(path.read_text())
+
+
 def run(options: argparse.Namespace) -> None:
     """Train, score and write the tables. Raises ValueError as `setting_of`."""
     setting, test = setting_of(options)
@@ -255,15 +305,9 @@ def run(options: argparse.Namespace) -> None:
         scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
         for number, (clip, level) in enumerate(tasks)
     ]
-    budget = Budget(None if options.steps else options.minutes, options.steps)
     results: dict[str, dict] = {}
-    for name in options.networks:
-        rates = "-".join(f"{rate:g}" for rate in options.rates)
-        path = options.out / f"{named(setting, name, budget)}-{rates}-{options.crop}.json"
-        if not path.exists():
-            net, about = trained(setting, name, best_rate(setting, name, budget, options.rates, options.crop), budget)
-            write_atomically(path, json.dumps(about | {"clips": tested(net, scenes)}, indent=1).encode())
-        results[name] = json.loads(path.read_text())
+    for name, measure in measures(setting, scenes, options).items():
+        results[name] = measure()
         sheets = tables(results)
         write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
     for sheet in sheets:
@@ -290,6 +334,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--width", type=float, default=0.25, help="numbers of feature maps over the published ones (default: 0.25)")
     add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
     add("--networks", nargs="+", default=names, choices=names, help="default: all")
+    add("--untrained", action="store_true", help="non-local means, total variation, and BM3D, BM4D if installed, too")
     add("--out", type=Path, default=Path("build/networks"), help="default: build/networks")
     options = parser.parse_args(argv)
     if options.minutes <= 0 or (options.steps is not None and options.steps < 1):
