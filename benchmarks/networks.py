@@ -8,7 +8,8 @@ Every network sees the same noise and the same pieces of the same clips in the s
 three, each tried for a sixth of that time and judged on the split's validation clips, which are neither trained on nor
 tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained
 on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
-a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. Outputs are scored as they are,
+a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained`
+adds methods that need no training, tuned on the first validation clip. Outputs are scored as they are,
 and scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes.
 """
 
