@@ -160,8 +160,10 @@ def draw_curves(records: Sequence[dict], filling: dict[str, list[float]], in_wor
     against_light.set_xticks(lights, [in_words(light) for light in lights])
     against_light.minorticks_off()
     against_light.legend(fontsize=8)
-    for clip, values in filling.items():
-        memory.plot(range(1, len(values) + 1), values, "o-", ms=3, label=clip)
+    against_frame.legend(fontsize=8)
+    for number, (label, values) in enumerate(filling.items()):  # each clip as it is, and scaled
+        line, colour = ("o-", "o--")[number % 2], f"C{9 - number // 2 % 7}"  # not a colour of the methods
+        memory.plot(range(1, len(values) + 1), values, line, ms=3, color=colour, label=label)
     memory.legend(fontsize=8)
     names = ("light of the scene", "number of the frame", "frames seen, the scored one included")
     titles = (
