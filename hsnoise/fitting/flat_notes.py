@@ -77,12 +77,13 @@ def _scattered(found: FlatGain, c: int, of: str) -> list[str]:
     """Levels that no smooth curve describes."""
     if found.described[c] or not found.used[:, c].any():
         return []
-    levels = found.level_gain[found.used[:, c], c]
+    used = found.used[:, c]
+    levels, top = found.level_gain[used, c], found.signal_dn[used, c].max()
     return [
-        f"Neither a line nor a smooth curve describes the flats{of}: variance over signal ranges from"
-        f" {levels.min():.4g} to {levels.max():.4g} DN/e- (chi2 {found.chi2[c]:.0f} for {found.dof[c]} degrees of"
-        f" freedom). The gain is from EMVA 1288's line, levels up to {LINE_RANGE:.0%} of saturation; its error is the"
-        " scatter of the levels."
+        f"Neither a line nor a smooth curve describes the flats{of} (chi2 {found.chi2[c]:.0f} for {found.dof[c]}"
+        f" degrees of freedom). The gain is from EMVA 1288's line through the {used.sum()} levels up to {top:.4g} DN,"
+        f" below {100 * LINE_RANGE:.0f} % of where the variance leaves its curve; their variance over signal is"
+        f" {levels.min():.4g} to {levels.max():.4g} DN/e-, and the error of the gain is their scatter."
     ]
 
 
@@ -113,7 +114,7 @@ def stated_gain_note(stated: StatedGain | None, gain_dn_per_e: float, error: flo
     off = abs(stated.value_dn_per_e - gain_dn_per_e)
     if off <= max(WRONG * stated.value_dn_per_e, WRONG_SIGMAS * error):
         return []
-    kind = "is wrong or nominal" if stated.certain else "is wrong, or no gain in e-/DN"
+    kind = "is wrong or nominal" if stated.certain else "is wrong, or not a gain in e-/DN"
     return [
         f"The header states {stated.source}, but these frames say {1 / gain_dn_per_e:.3g} e-/DN"
         f" ({gain_dn_per_e:.4g} ± {error:.2g} DN/e-): the header's value {kind}."
