@@ -135,13 +135,15 @@ def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
         used = found.used[shown, c]
         _points(axes, channel, signal, found.level_gain[shown, c], ~used, found.level_error[shown, c])
         if used.any():
-            light_dn = np.geomspace(signal[used].min(), signal[used].max() * 1.001, CURVE_POINTS)
+            light_dn = np.geomspace(signal[used].min() / 1.2, signal[used].max() * 1.2, CURVE_POINTS)
             axes.plot(
                 light_dn, found.gain[c] * variance_curve(found, c, light_dn), color=COLOURS[channel], linewidth=1.6
             )
-            axes.plot(light_dn, local_gain(found, c, light_dn), "--", color=COLOURS[channel], linewidth=1.2)
+            if found.bend[c].any():
+                axes.plot(light_dn, local_gain(found, c, light_dn), "--", color=COLOURS[channel], linewidth=1.2)
     axes.plot([], [], "-", color="0.3", label="curve of the variance")
-    axes.plot([], [], "--", color="0.3", label="local gain")
+    if found.bend.any():
+        axes.plot([], [], "--", color="0.3", label="local gain")
     axes.set_xscale("log")
     plain_log(axes.xaxis)
     _gain_limits(axes, found)

@@ -90,12 +90,14 @@ def _population(panels, name: str, measured: np.ndarray, sampled: np.ndarray, no
     top.axvspan(-noise, noise, color="0.92")
     _steps(top, name, measured, sampled, edges)
     top.legend(fontsize=9, loc="upper right", framealpha=0.9)
-    for values, colour, style in ((measured, COLOURS[name], "-"), (sampled, FIT, "--")):
+    lines = {"measured": (measured, COLOURS[name], "-"), "sampled": (sampled, FIT, "--")}
+    for label, (values, colour, style) in lines.items():
         x = np.sort(values)
         share = 1 - np.arange(len(x)) / len(x)
         some = np.unique(np.append(np.linspace(0, len(x) - 1, 400), len(x) - np.geomspace(1, len(x), 400)).astype(int))
-        below.plot(x[some], share[some], style, color=colour, linewidth=1.5)
+        below.plot(x[some], share[some], style, color=colour, linewidth=1.5, label=label)
     below.set_yscale("log")
+    below.legend(fontsize=9, loc="upper right", framealpha=0.9)
     for axes in panels:
         wide_axis(axes, edges)
         tidy(axes)
