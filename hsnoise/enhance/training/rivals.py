@@ -21,7 +21,7 @@ from hsnoise.enhance.training.anscombe import Anscombe
 from hsnoise.enhance.training.protocol import scaled_to
 from hsnoise.enhance.training.scenes import Scene
 
-STRENGTHS = (0.5, 1.0, 1.5, 2.0, 4.0, 8.0)
+STRENGTHS = (0.5, 1.0, 1.5, 2.0, 4.0, 8.0, 16.0, 32.0)
 WEIGHT_OF_SIGMA = 0.8  # of total variation, for a noise of 1
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]  # frames [frame, row, column, channel], sigma
