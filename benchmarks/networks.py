@@ -8,9 +8,9 @@ Every network sees the same noise and the same pieces of the same clips in the s
 three, each tried for a sixth of that time and judged on the split's validation clips, which are neither trained on nor
 tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained
 on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
-a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained`
-adds methods that need no training, tuned on the first validation clip. Outputs are scored as they are,
-and scaled in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes.
+a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained` adds methods that
+need no training, tuned on the first validation clip. Outputs are scored as they are, and scaled in brightness to the
+truth. Finished trainings and scores are kept in `--out`; the same command resumes.
 """
 
 from __future__ import annotations
@@ -31,9 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from rich.console import Console
-from skimage.metrics import structural_similarity
 
-from benchmarks.noise_ablation import standard_error
 from benchmarks.rivals.fastdvdnet import FastDVDnet
 from benchmarks.rivals.ffdnet import FFDNet
 from benchmarks.rivals.kpn import KPN
@@ -43,12 +41,14 @@ from hsnoise._core.keys import named_key
 from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
+from hsnoise.enhance.training.evaluate import Method, prepared, scores
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
-from hsnoise.enhance.training.rivals import Denoiser, denoised, rivals, tuned
+from hsnoise.enhance.training.rivals import Denoiser, rivals
 from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
+from hsnoise.enhance.training.tables import standard_error
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import read_arrays, write_arrays
 from hsnoise.model import NoiseModel
@@ -145,12 +145,12 @@ def _step(state, batch: Batch, key, model: NoiseModel, light, sensor: Shape | No
 def scores_of(found: np.ndarray, scene: Scene) -> dict[str, float]:
     """PSNR and SSIM as it is and scaled in brightness to the truth, means over frames."""
 
-    def measured(frames: np.ndarray) -> tuple[float, float]:
-        pairs = list(zip(np.clip(frames, 0, 1), scene.clean, strict=True))
-        ssim = [structural_similarity(a, b, channel_axis=-1, data_range=1.0) for a, b in pairs]
-        return float(np.mean([psnr_db(a, b) for a, b in pairs])), float(np.mean(ssim))
+    def measured(frames: np.ndarray) -> tuple[float, ...]:
+        of_frames = scores("", scene, frames)
+        return tuple(float(np.mean([one[what] for one in of_frames])) for what in ("psnr_db", "ssim"))
 
-    return dict(zip(SCORES, (*measured(found), *measured(scaled_to(found, scene.clean))), strict=True))
+    as_is, scaled = measured(np.clip(found, 0, 1)), measured(scaled_to(found, scene.clean))
+    return dict(zip(SCORES, (*as_is, *scaled), strict=True))
 
 
 @eqx.filter_jit
@@ -206,15 +206,7 @@ def _of_scene(net: Any, scene: Scene) -> np.ndarray:
     return np.asarray(_enhanced(net, scene.noisy))
 
 
-def prepared(setting: Setting, name: str, denoise: Denoiser, crop: int) -> Callable[[Scene], np.ndarray]:
-    """A method that is not trained, with the strength and domain that do best on the first validation clip."""
-    mean_e = middle_of(setting.camera.mean_e)
-    strength, domain = tuned(denoise, scene_of(setting.validation[0], setting.camera, mean_e, crop, 99, TESTED_FRAMES))
-    print(f"{name}: best at {strength:g} times the noise in {domain}", flush=True)
-    return partial(denoised, denoise, strength=strength, domain=domain)
-
-
-def tested(method: Callable[[Scene], np.ndarray], scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
+def tested(method: Method, scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
     """Scores of each video, means over levels of light. method: display values of a scene."""
     found: dict[str, list[dict[str, float]]] = {}
     for scene in scenes:
@@ -276,7 +268,9 @@ def measures(
         return about | {"clips": tested(partial(_of_scene, net), scenes)}
 
     def of_untrained(name: str, denoise: Denoiser) -> dict[str, Any]:
-        return {"clips": tested(prepared(setting, name, denoise, options.crop), scenes)}
+        mean_e = middle_of(setting.camera.mean_e)
+        tuning = scene_of(setting.validation[0], setting.camera, mean_e, options.crop, 99, TESTED_FRAMES)
+        return {"clips": tested(prepared(name, denoise, tuning), scenes)}
 
     rates = "-".join(f"{rate:g}" for rate in options.rates)
     found = {

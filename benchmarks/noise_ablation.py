@@ -39,6 +39,7 @@ from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.criticism.improve import improved
 from hsnoise.enhance.mosaic import electrons_of
+from hsnoise.enhance.training import tables
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.presets import Recipe
@@ -104,8 +105,9 @@ def trained(
     camera: Camera, name: str, noise: NoiseModel | np.ndarray, clips: Sequence[Clip], seed: int, options
 ) -> Path:
     """Path of the weights of a network trained with the noise called `name`: a model's, or that of dark frames."""
-    model = camera.model if isinstance(noise, np.ndarray) else noise
-    if model is noise:
+    darks = noise if isinstance(noise, np.ndarray) else None
+    model = noise if darks is None else camera.model
+    if darks is None:
         camera = levelled(camera, level_of(drawn_darks(model)))
     sizes = (options.stride, options.side, options.jitter, camera.sensor, camera.mean_e, PROTOCOL)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
@@ -118,11 +120,12 @@ def trained(
     state = trainer.start(seed)
     text = f"{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
-        batch = crops(clips, batch_rng(seed, step), BATCH, FRAMES, options.side)
-        if model is noise:
+        rng = batch_rng(seed, step)
+        batch = crops(clips, rng, BATCH, FRAMES, options.side)
+        if darks is None:
             state, value = trainer.step(state, batch, seed, step)
         else:
-            state, value = trainer.learn(state, *real_examples(batch, noise, camera, batch_rng(seed + 1, step)))
+            state, value = trainer.learn(state, *real_examples(batch, darks, camera, rng))
     about = {"camera": camera.name, "noise": name, "steps": options.steps, "clips": [clip.name for clip in clips]}
     save_network(path, trainer.network(state), about)
     print(f"{text}: loss {float(value):.4f}", flush=True)
@@ -249,7 +252,7 @@ def gain_of(differences: list[dict[str, float]]) -> tuple[float, float]:
 
 def standard_error(means: Sequence[float]) -> float:
     """Standard error of the mean of these means; 0 for a single one, which cannot show it."""
-    return float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
+    return tables.standard_error(means) if len(means) > 1 else 0.0
 
 
 def judged(

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.statistics.pixels.shading import Shading
+from hsnoise.statistics.pixels.shading import FAR, Shading
 from hsnoise.statistics.pixels.survey import Plane
 
-FAR = 6.0  # typical deviations beyond which a line has a defect
 FEW = 0.05  # share of lines with a defect; of more, levels have two or three values, as bands leave them
 EFFICIENCY = 2 / 3  # of differences of neighbours, which overlap
 ALIKE, BEYOND_CHANCE = 0.5, 5.0  # share of the variance, and its errors, that neighbours have in common

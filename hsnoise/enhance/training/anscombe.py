@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise._core.types import cfa_tile
+from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.model import NoiseModel
-
-ROUNDING_DN2 = 1 / 12  # variance of rounding to whole counts
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Anscombe:
         gain = np.broadcast_to(np.asarray(params["gain"].value, float), (channels,))
         read_e = np.broadcast_to(np.asarray(params["read_noise"].sigma if "read_noise" in params else 0.0), (channels,))
         dark_e = float(params["dark_current"].rate) * params.exposure_s if "dark_current" in params else 0.0
-        rounding_dn2 = ROUNDING_DN2 if "adc" in params else 0.0
+        rounding_dn2 = ROUNDING_VARIANCE if "adc" in params else 0.0
         pixels = np.bincount(tile.reshape(-1), minlength=channels)
         return cls(pixels, read_e**2 + dark_e + rounding_dn2 / gain**2)
 

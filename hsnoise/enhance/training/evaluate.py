@@ -19,7 +19,7 @@ from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Clip, check_sizes, read_clips, source_of
 from hsnoise.enhance.training.noisy import Camera, camera_of
 from hsnoise.enhance.training.protocol import OPTICS, PROTOCOL, scaled_to
-from hsnoise.enhance.training.rivals import denoised, not_installed, rivals, tuned
+from hsnoise.enhance.training.rivals import Denoiser, denoised, not_installed, rivals, tuned
 from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import Split, split_of
 from hsnoise.enhance.training.steps import digest_of
@@ -127,10 +127,15 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
     if untrained and not_installed():
         print(f"Note: {' and '.join(not_installed())} are left out: pip install 'hsnoise[peers]'")
     for name, denoise in rivals().items() if untrained else ():
-        strength, domain = tuned(denoise, tuning)
-        found[name] = partial(denoised, denoise, strength=strength, domain=domain)
-        print(f"{name}: best at {strength:g} times the noise in {domain}")
+        found[name] = prepared(name, denoise, tuning)
     return found
+
+
+def prepared(name: str, denoise: Denoiser, tuning: Scene) -> Method:
+    """A rival that is not trained, with the strength and domain that do best on a scene that is not scored."""
+    strength, domain = tuned(denoise, tuning)
+    print(f"{name}: best at {strength:g} times the noise in {domain}", flush=True)
+    return partial(denoised, denoise, strength=strength, domain=domain)
 
 
 def outputs(methods: dict[str, Method], scene: Scene) -> dict[str, np.ndarray]:

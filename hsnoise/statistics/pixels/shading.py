@@ -10,7 +10,8 @@ from scipy.ndimage import median_filter
 LENGTHS = (*np.geomspace(0.01, 3.0, 20), 10.0)  # in widths of the frame; the last is a straight line
 LEAST_SHARE = 0.3  # of the variance of the means that a shading must explain
 THERE = 5.0  # standard errors
-NEIGHBOURS, FAR = 9, 6.0  # lines; typical deviations from their median beyond which a line has a defect
+NEIGHBOURS = 9  # lines, with whose median a line is compared
+FAR = 6.0  # typical deviations beyond which a line has a defect
 
 
 class Shading(NamedTuple):
