@@ -22,7 +22,7 @@ def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
     if truth is not None:
         table.add_column("truth", justify="right", no_wrap=True)
         table.add_column("off by", justify="right", no_wrap=True)
-    for name, (value, error, unit) in (fit.shown if truth is None else fit.table).items():
+    for name, (value, error, unit) in (fit.shown if truth is None else fit.in_order).items():
         cells = [name, *rounded(value, error), unit_in_words(unit)]
         if name in true_values:
             true_value = true_values[name][0]

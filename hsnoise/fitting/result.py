@@ -208,14 +208,16 @@ class FitResult:
         return value * gain, error * gain, unit.replace("e-", "DN")
 
     @property
-    def shown(self) -> dict[str, tuple[float, float, str]]:
-        """The rows of `table` as they are printed: what every camera has first, and so on a screen that is cut.
-
-        Without a gain, single pixels still tell electrons as DN.
-        """
+    def in_order(self) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table`, what every camera has first: on a screen that cuts the rest, it is seen."""
         table = self.table
         first = [name for base in BASE if base in self.params for name in self.rows_of(base)]
-        rows = {name: table[name] for name in dict.fromkeys([*first, *table])}
+        return {name: table[name] for name in (*first, *table)}
+
+    @property
+    def shown(self) -> dict[str, tuple[float, float, str]]:
+        """The rows of `table` as they are printed: without a gain, single pixels still tell electrons as DN."""
+        rows = self.in_order
         if self.has_gain or self.transfer is None:
             return rows
         in_e = [name for name in self.withheld if name in rows and rows[name][2] in ("e-", "e-/s")]
