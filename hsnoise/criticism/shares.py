@@ -13,6 +13,7 @@ from rich.table import Table
 from scipy.stats import norm
 
 from hsnoise._core.keys import named_key
+from hsnoise._core.threads import in_threads
 from hsnoise._core.types import RandomKey, cfa_tile, seconds
 from hsnoise.criticism import rules
 from hsnoise.frames.stack import FrameStack
@@ -183,7 +184,9 @@ def static_dn2(frames: FrameStack) -> float:
 
 
 def _drawn(model: NoiseModel, like: FrameStack, key: RandomKey) -> list[dict[Place, Components]]:
-    return [_components(draw_capture(jax.random.fold_in(key, number), model, like)) for number in range(DRAWS)]
+    return in_threads(
+        lambda number: _components(draw_capture(jax.random.fold_in(key, number), model, like)), range(DRAWS)
+    )
 
 
 def _static(found: list[dict[Place, Components]]) -> float:
