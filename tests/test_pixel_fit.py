@@ -269,3 +269,52 @@ def test_a_dark_signal_is_subtracted_where_pedestals_fall_on_a_line(pedestal_dn,
     rate, error = subtracted(moved, (0.0, 1.0))
     assert (rate > SUBTRACTED * error) == there
     assert abs(rate - 0.5 * there) < 4 * error
+
+
+@pytest.mark.parametrize("shape", [(160, 160), pytest.param((256, 256), marks=pytest.mark.slow)])
+def test_pixels_that_are_noisier_than_others_do_not_pass_for_signal(shape, rng):
+    """As in scientific CMOS sensors; outliers of the short exposure that were none in the long one: gain 16 % high."""
+    gain, exposures, frames = 2.1, (0.01, 1.0, 5.0), 30
+    sigma = 1.2 * np.exp(rng.gamma(1.0, 0.35, shape))
+    dark, offsets = 0.5 * rng.lognormal(-0.5, 1.0, shape), 2.0 * rng.standard_normal(shape)
+    darks = [
+        100 + offsets + gain * (rng.poisson(dark * t, (frames, *shape)) + sigma * rng.standard_normal((frames, *shape)))
+        for t in exposures
+    ]
+    fit = hsnoise.fit(np.round(darks).clip(0).astype(np.uint16), exposure_s=exposures)
+    value, error, _ = fit.table["gain"]
+    assert abs(value - gain) < 3.5 * error < 0.1 * gain
+
+
+def test_a_few_wild_counts_move_nothing(rng):
+    """As of counts that were below 0 and wrapped around: whole rows had differed in read noise by a factor of e^86."""
+    shape = (160, 160)
+    sigma, offsets = 3.0 * np.exp(0.2 * rng.standard_normal(shape)), 2.0 * rng.standard_normal(shape)
+    darks = np.round(100 + offsets + sigma * rng.standard_normal((2, 12, *shape))).astype(np.uint16)
+    wild = darks.copy()
+    wild.reshape(-1)[rng.choice(wild.size, 20, replace=False)] = 65500
+    fits = [hsnoise.fit(of, exposure_s=(0.001, 0.01), pixels="differ") for of in (darks, wild)]
+    for name in ("read_noise.sigma", "read_noise_nonuniformity.spread", "read_noise_nonuniformity.row_spread"):
+        before, after = (
+            fit.in_dn("read_noise_nonuniformity" if "spread" in name else "read_noise")[name] for fit in fits
+        )
+        assert abs(after[0] - before[0]) < 2 * max(before[1], 0.005), name
+
+
+@pytest.mark.parametrize("after_gain", [True, False])
+def test_colours_say_on_which_side_of_the_gain_rows_share_noise(after_gain, rng):
+    """Rows of one size in DN were drawn as one size in electrons, 1.95 DN for 1.34 in red."""
+    shape, frames, sigma_e = (96, 160), 8, 0.5
+    gain = np.tile([[4.0, 2.0], [2.0, 3.0]], (shape[0] // 2, shape[1] // 2))
+    dark = 3.0 * rng.lognormal(-0.3, 0.8, shape)
+
+    def exposure(seconds):
+        rows = sigma_e * rng.standard_normal((frames, shape[0], 1)) * (2.75 if after_gain else gain)
+        electrons = rng.poisson(dark * seconds, (frames, *shape)) + 1.4 * rng.standard_normal((frames, *shape))
+        return np.round(200 + gain * electrons + rows).astype(np.uint16)
+
+    darks = np.array([exposure(t) for t in (0.02, 1.0, 5.0)])
+    fit = hsnoise.fit(darks, exposure_s=(0.02, 1.0, 5.0), cfa="RGGB")
+    value, error, _ = fit.table["row_noise.sigma"]
+    assert fit.params["row_noise"].after_gain is after_gain
+    assert abs(value - sigma_e) < 4 * error < 0.1

@@ -212,6 +212,24 @@ def test_wrong_lazy_values_show_when_the_frame_is_read(counts, message):
     assert "frame 1" in str(error.value)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("level", [0.0, 4.0])
+def test_counts_that_wrapped_below_zero_are_refused(kind, level, rng):
+    """A bias subtracted in unsigned integers: the fit had ended in "SVD did not converge"."""
+    counts = np.round(level + 3 * rng.standard_normal((4, 64, 96))).astype(np.int32).astype(kind)
+    with pytest.raises(
+        ValueError, match=r"frame 0 of dark exposure 0 .* of the counts lie just below .* wrapped around"
+    ):
+        FrameStack(counts, 1.0)
+
+
+@pytest.mark.parametrize("hot", [65535, 64000])
+def test_hot_pixels_that_saturate_have_not_wrapped(hot, rng):
+    counts = np.round(100 + 3 * rng.standard_normal((4, 64, 96))).astype(np.uint16)
+    counts[:, :2] = hot
+    FrameStack(counts, 1.0)
+
+
 def test_half_saturated_is_allowed_and_more_is_not():
     counts = dark_counts(2, 4, 4)
     counts[:, :2] = 1000

@@ -32,7 +32,7 @@ from hsnoise.effects import (
 )
 from hsnoise.fitting.pixel_fit import Channel, PixelFit, weighted_mean
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
-from hsnoise.fitting.pixel_patterns import PATTERNS
+from hsnoise.fitting.pixel_shared import Shared, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -71,7 +71,6 @@ OF_PIXELS = (
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
-PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
 
@@ -79,7 +78,8 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     """The result; `model` says which effects are wanted (None: the paper's, and those of the population found)."""
     gain, read, rate = _electrons(pixel)
     longest_s = float(np.max(summary.exposure_s, initial=0.0))
-    population = _with_banks(_population(pixel, gain, longest_s), pixel, model)
+    shared = shared_patterns(pixel.channels, gain, summary.cfa)
+    population = _with_banks(_population(pixel, gain, shared, longest_s), pixel, model)
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
     black, row = _black(pixel, summary), _rows(pixel)
@@ -92,7 +92,7 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
         black_level=black[0],
     )
     with jax.enable_x64(True):
-        params = _model(wanted, paper, population, pixel)
+        params = _model(wanted, paper, population, pixel, shared)
     names, covariance = _covariance(pixel, params, population, black[1], row[1])
     errors = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
     numbers = numbers_of(params)
@@ -138,23 +138,16 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
     return np.ones(n), float(np.sqrt(floor)), float(np.mean([c.values[2] for c in pixel.channels]))
 
 
-def _population(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
+def _population(
+    pixel: PixelFit, gain: np.ndarray, shared: Mapping[str, Shared], longest_s: float
+) -> dict[str, dict[str, tuple[float, float]]]:
     """The significant population effects: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     drift = _shading(pixel)
     if drift is not None:
         _, one = drift
         found["black_shading"] = {"amplitude": (one.amplitude_dn, one.error_dn), "length": (one.length, 0.0)}
-    for name in PATTERNS.values():
-        many_of = [
-            (c.patterns.get(name, (0.0, 0.0, 0.0)), g, c.temporal_dn2)
-            for c, g in zip(pixel.channels, gain, strict=True)
-        ]
-        variance, error = _mean([(of[0] / g**2, of[1] / g**2) for of, g, _ in many_of])
-        _, chance = _mean([(0.0, of[2] / g**2) for of, g, _ in many_of])
-        noise = float(np.mean([t / g**2 for _, g, t in many_of]))
-        if variance > max(PATTERN_THERE * chance, LEAST_PATTERN * noise):
-            found[name] = {"sigma": (np.sqrt(variance), error / (2 * np.sqrt(variance)))}
+    found |= {name: {"sigma": of.sigma} for name, of in shared.items()}
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
@@ -327,7 +320,9 @@ def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
     return np.array(sigma), np.array(error)
 
 
-def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: PixelFit) -> NoiseModel:
+def _model(
+    wanted: list[str], paper: NoiseModel, population: Mapping, pixel: PixelFit, shared: Mapping[str, Shared]
+) -> NoiseModel:
     """The wanted effects, from the paper's model and the population."""
     effects: list[AbstractEffect] = [paper[name] for name in wanted if name in paper]
     classes: dict[str, Any] = {cls.name: cls for cls in OF_PIXELS}
@@ -339,12 +334,14 @@ def _model(wanted: list[str], paper: NoiseModel, population: Mapping, pixel: Pix
             }
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
             fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}
-            effects.append(classes[name](**fields, **_settings(name, pixel)))
+            effects.append(classes[name](**fields, **_settings(name, pixel, shared)))
     return NoiseModel(effects, cfa=paper.cfa, shutter=paper.shutter, exposure_s=paper.exposure_s)
 
 
-def _settings(name: str, pixel: PixelFit) -> dict[str, Any]:
+def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[str, Any]:
     """What an effect has besides numbers."""
+    if name in shared:
+        return {"after_gain": shared[name].after_gain}
     if name == "black_shading" and (drift := _shading(pixel)) is not None:
         return {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
     if name == "periodic_banding" and (wave := pixel.channels[0].banding) is not None:

@@ -10,6 +10,9 @@ import numpy as np
 from hsnoise._core.types import channels_of
 from hsnoise.frames.bayer import channel_pixels
 
+WRAPPED = 1e-3  # share of the counts
+STARTS, BETWEEN = 2, 0.1  # DN; share of those that wrapped
+
 
 def check_values(frame: np.ndarray, *, white_level: float | None = None, name: str = "counts") -> None:
     """Check the values of one raw frame `[row, column]`, DN.
@@ -20,8 +23,8 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
         name: what to call the frame in an error.
 
     Raises:
-        ValueError: values that are not finite, not integers, negative, too large, all the same, or mostly at
-            the white level.
+        ValueError: values that are not finite, not integers, negative, negative before they wrapped around, too large,
+            all the same, or mostly at the white level.
     """
     if frame.dtype.kind == "f":
         if not np.isfinite(frame).all():
@@ -38,6 +41,11 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
         )
     if high > np.iinfo(np.int32).max:
         raise ValueError(f"{name}: counts must fit in 31 bits, got {high:g}")
+    if frame.dtype.kind == "u" and (share := wrapped_share(frame, high)) > WRAPPED:
+        raise ValueError(
+            f"{name}: {share:.1%} of the counts lie just below {np.iinfo(frame.dtype).max + 1} and the others near 0: "
+            "counts below 0 have wrapped around, as where a dark is subtracted from unsigned counts; give the raw frames"
+        )
     if low == high:
         what = "all zero" if high == 0 else f"all {high:g}"
         raise ValueError(f"{name}: counts are {what}; a frame without any noise cannot be raw sensor data")
@@ -48,6 +56,21 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
                 f"{name}: {saturated:.0%} of the pixels reach white_level {white_level:g} DN (saturated); "
                 "shorten the exposure or correct white_level"
             )
+
+
+def wrapped_share(frame: np.ndarray, highest: int) -> float:
+    """Share of unsigned counts that were below 0 and have wrapped around: far above, next to the type's end.
+
+    The others must begin at 0, and next to none lie between; pixels that saturate at the end itself are none of them.
+    """
+    end = np.iinfo(frame.dtype).max
+    if highest < end - end // 8:
+        return 0.0
+    values = _thin(frame.ravel())
+    above, below = values > end - end // 8, values < end // 8
+    share, between = float(np.mean(above & (values < end))), 1.0 - float(np.mean(above | below))
+    continues = below.any() and int(values[below].min()) <= STARTS
+    return float(above.mean()) if continues and between < BETWEEN * share else 0.0
 
 
 def check_black_level(frames: Sequence[np.ndarray], black_level: Any, cfa: str) -> None:

@@ -128,7 +128,8 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
 
 def _typical(group: Group, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels without outliers, DN^2, and its standard error."""
-    return without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)
+    mean, error = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)
+    return max(mean, 0.0), error  # the noise of row and column offsets has been subtracted
 
 
 def _median(group: Group, c: int) -> float:

@@ -232,12 +232,16 @@ def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, f
     mean, spread, error, apart = np.zeros(size), np.ones(size), np.full(size, np.inf), np.zeros(size)
     ordinary = np.median(level, axis=1)
     floor = np.median(variance, axis=1)
-    scatter = _level_scatter(members, level, other, t)
+    scatter, exposures = _level_scatter(members, level, other, t), range(len(level))
     for c, inside in enumerate(members):
-        for e in range(len(level)):
+        bright = (other[:, inside] - ordinary[:, None]).astype(np.float64)
+        calm = [peak[e, inside] < OUTLIER_SIGMAS * _expected_scale(variance[e, inside], bright[e]) for e in exposures]
+        apart[c] = len(inside) - np.sum(calm, axis=1)
+        # The same pixels at all exposures: those that are noisy without signal are outliers there, but no longer beside
+        # its noise, and the signal would seem to have made theirs.
+        kept = np.all(calm, axis=0)
+        for e in exposures:
             v, y = variance[e, inside].astype(np.float64), level[e, inside].astype(np.float64)
-            kept = peak[e, inside] < OUTLIER_SIGMAS * _expected_scale(v, other[e, inside] - ordinary[e])
-            apart[c, e] = len(inside) - kept.sum()
             mean[c, e] = y[kept].mean() if kept.any() else y.mean()
             if kept.sum() < FEWEST_PIXELS or np.quantile(y, 0.999) > FILLED * full_scale_dn:
                 continue
@@ -245,7 +249,7 @@ def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, f
             if spread[c, e] <= 0:
                 spread[c, e] = 1.0
                 continue
-            error[c, e] = _chance_error(v[kept], other[e, inside][kept] - ordinary[e], floor[e], dof[e])
+            error[c, e] = _chance_error(v[kept], bright[e, kept], floor[e], dof[e])
             if np.quantile(y, 0.001) < NEAR_ZERO_SIGMAS * np.sqrt(spread[c, e]):
                 mean[c, e], spread[c, e], growth = unclipped(mean[c, e], spread[c, e], scatter[c, e])
                 error[c, e] *= growth

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier
+from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier, without_outliers
 from hsnoise.statistics.pixels.structure import covariance_terms
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -56,7 +56,8 @@ def _of_lines(found: Survey, channel: int, read_dn2: float) -> tuple[Number, Num
     # Shot noise of rows with more dark signal is no read noise.
     if min(frames) < 2 or np.median(both, 1).max() > MOSTLY_READ * read_dn2:
         return nothing, nothing
-    share = min(read_dn2 / float(np.sqrt(np.prod(both.mean(1)))), 1.0)  # of the noise, which differs by less
+    noise_dn2 = [without_outliers(of, n)[0] for of, n in zip(both, frames, strict=True)]
+    share = min(read_dn2 / float(np.sqrt(np.prod(noise_dn2))), 1.0)  # of the noise, which differs by less
     shape = 2, len(groups[0].of(channel)), -1, len(groups[0].of(channel)[0].column_mean_dn)
     planes, levels = both.reshape(shape), groups[0].pixels(channel, "level_dn").reshape(shape)
     spreads = []

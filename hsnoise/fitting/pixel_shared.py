@@ -1,0 +1,64 @@
+"""What whole frames, rows and columns share, in electrons: before the gain or, where colours say so, after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from hsnoise._core.types import cfa_tile
+from hsnoise.fitting.pixel_patterns import PATTERNS
+
+PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
+AFTER = 12.0  # by which chi2 must be less for a pattern of one size in DN than for one of one size in electrons
+
+
+class Channel(Protocol):
+    """What a colour shares: by effect, variance, standard error and chance deviation, DN^2; noise of its pixels."""
+
+    patterns: Mapping[str, tuple[float, float, float]]
+    temporal_dn2: float
+
+
+class Shared(NamedTuple):
+    """Standard deviation of what is shared, e-, and its error; whether it arises after the gain."""
+
+    sigma: tuple[float, float]
+    after_gain: bool
+
+
+def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> dict[str, Shared]:
+    """The patterns beyond chance by the effect that draws them; gain [channel], DN/e-.
+
+    Electrons of a pattern after the gain are DN over the mean gain of the pixels, as in the effects.
+    """
+    found = {}
+    noise = float(np.mean([c.temporal_dn2 / g**2 for c, g in zip(channels, gain, strict=True)]))
+    for name in PATTERNS.values():
+        variance, error, chance = np.array([c.patterns.get(name, (0.0, 0.0, 0.0)) for c in channels]).T
+        after = is_after_gain(variance, error, gain)
+        scale = np.full(len(gain), gain[cfa_tile(cfa)].mean()) if after else gain
+        mean = float(np.mean(variance / scale**2))
+        if mean > max(PATTERN_THERE * _error_of_mean(chance / scale**2), LEAST_PATTERN * noise):
+            of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
+            found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
+    return found
+
+
+def is_after_gain(variance_dn2: np.ndarray, error_dn2: np.ndarray, gain: np.ndarray) -> bool:
+    """Whether variances [channel] are alike in DN, not in electrons; False where gains or errors do not tell."""
+    if len(gain) < 2 or not (error_dn2 > 0).all():
+        return False
+    as_electrons, as_dn = (_off_by(variance_dn2, error_dn2, shape) for shape in (gain**2, np.ones_like(gain)))
+    return as_electrons - as_dn > AFTER
+
+
+def _off_by(values: np.ndarray, errors: np.ndarray, shape: np.ndarray) -> float:
+    """Chi2 of values of that shape, of any size."""
+    shape, values = shape / errors, values / errors
+    return float(((values - shape * (shape @ values) / (shape @ shape)) ** 2).sum())
+
+
+def _error_of_mean(errors: np.ndarray) -> float:
+    return float(np.sqrt((errors**2).sum()) / len(errors))
