@@ -44,7 +44,7 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
     if frame.dtype.kind == "u" and (share := wrapped_share(frame, high)) > WRAPPED:
         raise ValueError(
             f"{name}: {share:.1%} of the counts lie just below {np.iinfo(frame.dtype).max + 1} and the others near 0: "
-            "counts below 0 have wrapped around, as where a dark is subtracted from unsigned counts; give the raw frames"
+            "counts below 0 wrapped around, as where a dark is subtracted from unsigned counts; give the raw frames"
         )
     if low == high:
         what = "all zero" if high == 0 else f"all {high:g}"
