@@ -57,6 +57,7 @@ MODEST = {
     "image_lag": 0.04,
     "odd_even_pattern": 0.8,  # e-
     "tap_offsets": 0.8,  # e-
+    "tap_gains": 0.06,  # relative
     "black_shading": 1.5,  # DN, rms
     "missing_codes": 0.6,  # digital gain minus 1
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
@@ -162,11 +163,11 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
         out["offset"] = size * rng.standard_normal(shape)
     elif effect == "odd_even_pattern":
         out["offset"] = size * (_parity(camera, shape) - 0.5)
-    elif effect == "tap_offsets":
+    elif effect in ("tap_offsets", "tap_gains"):
         taps = int(rng.choice([2, 4, 8]))
         levels = rng.standard_normal(taps)
-        levels = (levels - levels.mean()) / max(levels.std(), 0.3)
-        out["offset"] = size * levels[c * taps // columns]
+        levels = size * ((levels - levels.mean()) / max(levels.std(), 0.3))[c * taps // columns]
+        out.update({"offset": levels} if effect == "tap_offsets" else {"gain": 1 + levels})
     elif effect == "black_shading":
         along = rng.choice([0, 1])
         line = np.exp(-np.arange(shape[along]) / (rng.uniform(0.05, 1.0) * shape[along]))[:: rng.choice([-1, 1])]

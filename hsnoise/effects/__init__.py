@@ -53,6 +53,7 @@ from hsnoise.effects.row_group_noise import RowGroupNoise
 from hsnoise.effects.row_noise import RowNoise
 from hsnoise.effects.shared_row_gain import SharedRowGain
 from hsnoise.effects.shot_noise import ShotNoise
+from hsnoise.effects.tap_gains import TapGains
 from hsnoise.effects.tap_offsets import TapOffsets
 
 EFFECTS: tuple[type[AbstractEffect], ...] = (
@@ -90,6 +91,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ImageLag,
     OddEvenPattern,
     TapOffsets,
+    TapGains,
     BlackShading,
     AdcNonuniformity,
     MissingCodes,
@@ -159,6 +161,7 @@ __all__ = [
     "SharedRowGain",
     "ShotNoise",
     "Stage",
+    "TapGains",
     "TapOffsets",
     "either_side",
     "param",

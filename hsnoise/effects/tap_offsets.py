@@ -1,4 +1,4 @@
-"""Blocks of columns that different output taps read."""
+"""Blocks of the frame that different outputs read."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
 from hsnoise.effects._parameters import param
+from hsnoise.effects._taps import check_taps, tap_of
 
 
 class TapOffsets(AbstractEffect):
-    """Each of `taps` equal blocks of columns has its own offset, Normal(0, sigma^2) in e-, the same in all frames.
+    """Each of `row_taps` x `taps` equal blocks has its own offset, Normal(0, sigma^2) in e-, the same in all frames.
 
-    Fast sensors read blocks of columns through separate outputs, whose offsets are only trimmed to some accuracy. The
-    mean of so few offsets is not zero; a fit sees it as part of the black level.
+    Fast sensors read blocks of columns through separate outputs, large ones their halves or quarters, and offsets are
+    only trimmed to some accuracy. The mean of so few offsets is not zero; a fit sees it as part of the black level.
 
-    In dark frames: vertical panels with sharp edges, the same in all exposures.
+    In dark frames: panels with sharp edges, the same in all exposures.
 
     Attributes:
-        taps: number of outputs, at least 2.
+        taps, row_taps: number of outputs over the columns and over the rows; at least 2 in all.
         after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
             Its electrons are then DN divided by the mean gain of the pixels.
 
@@ -35,15 +36,15 @@ class TapOffsets(AbstractEffect):
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over taps")
     taps: int = eqx.field(static=True, default=4)
     after_gain: bool = eqx.field(static=True, default=False)
+    row_taps: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        if not isinstance(self.taps, int) or self.taps < 2:
-            raise ValueError(f"tap_offsets.taps: expected a whole number of at least 2, got {self.taps!r}.")
+        check_taps(self.name, self.taps, self.row_taps)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        tap = capture.columns * self.taps // capture.sensor_shape[1]
-        offsets = jax.random.normal(capture.fixed_key(self.name), (self.taps,), signal.dtype)
-        return signal + capture.offset(self.sigma * offsets[tap][None, None], self.after_gain)
+        offsets = jax.random.normal(capture.fixed_key(self.name), (self.row_taps * self.taps,), signal.dtype)
+        of_pixels = offsets[tap_of(capture, self.taps, self.row_taps)][None]
+        return signal + capture.offset(self.sigma * of_pixels, self.after_gain)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:

@@ -36,6 +36,7 @@ from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.structure import beside_neighbours, double_differences, low_side_sigma, plane_rows
 from hsnoise.statistics.pixels.survey import Plane, Survey
+from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
@@ -99,6 +100,7 @@ class PixelFit:
 
     ringing: the part of the read noise that goes on along rows, if it is there.
     row_groups: rows that are read together, if there are.
+    taps: blocks of the frame that separate outputs read; None for one output.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -106,6 +108,7 @@ class PixelFit:
     flats: FlatGain | None
     ringing: Ringing | None
     row_groups: RowGroups | None
+    taps: Taps | None
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -113,6 +116,8 @@ class PixelFit:
 
 def measure(found: Survey, summary: Summary) -> PixelFit:
     """Pixel transfer, flats and population of all channels, and the joint estimate."""
+    taps = taps_of(found)
+    found = found if taps is None else levelled(found, taps)
     channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
     flats = None if summary.flats is None else flat_gain(summary.flats)
     if flats is not None and np.isfinite(flats.gain).all():
@@ -126,7 +131,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    return PixelFit(tuple(channels), flats, ringing, found.row_groups, estimate, covariance, bool(known.all()))
+    return PixelFit(tuple(channels), flats, ringing, found.row_groups, taps, estimate, covariance, bool(known.all()))
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:

@@ -29,10 +29,12 @@ from hsnoise.effects import (
     RowFixedPattern,
     RowGroupNoise,
     RowNoise,
+    TapGains,
+    TapOffsets,
 )
 from hsnoise.fitting.pixel_fit import Channel, PixelFit, weighted_mean
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
-from hsnoise.fitting.pixel_shared import Shared, shared_patterns
+from hsnoise.fitting.pixel_shared import Shared, of_taps, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -61,6 +63,8 @@ OF_PIXELS = (
     RowBankNoise,
     RowGroupNoise,
     ColumnNoise,
+    TapOffsets,
+    TapGains,
     BlackShading,
     CorrelatedReadNoise,
     CosmicRays,
@@ -148,6 +152,7 @@ def _population(
         _, one = drift
         found["black_shading"] = {"amplitude": (one.amplitude_dn, one.error_dn), "length": (one.length, 0.0)}
     found |= {name: {"sigma": of.sigma} for name, of in shared.items()}
+    found |= {} if pixel.taps is None else of_taps(pixel.taps, float(gain.mean()))
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
@@ -348,6 +353,8 @@ def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[
         return {"axis": wave[0]}
     if name == "row_group_noise" and (groups := pixel.row_groups) is not None:
         return dict(zip(("rows", "start", "row_banks", "column_banks"), groups.layout, strict=True))
+    if name in ("tap_offsets", "tap_gains") and pixel.taps is not None:
+        return {"taps": pixel.taps.columns, "row_taps": pixel.taps.rows}
     jumps = pixel.channels[0].jumps
     if name == "random_telegraph_noise" and jumps is not None:
         return {"double_sampling": jumps.double_sampling}

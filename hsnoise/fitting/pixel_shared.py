@@ -1,4 +1,4 @@
-"""What whole frames, rows and columns share, in electrons: before the gain or, where colours say so, after it."""
+"""What whole frames, rows, columns and outputs share, in electrons: before the gain or, as colours say, after it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_patterns import PATTERNS
+from hsnoise.statistics.pixels.taps import Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
+GAINS_THERE = 5.0  # standard errors of the spread of the gains of outputs
 AFTER = 12.0  # by which chi2 must be less for a pattern of one size in DN than for one of one size in electrons
 
 
@@ -43,6 +45,16 @@ def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> 
         if mean > max(PATTERN_THERE * _error_of_mean(chance / scale**2), LEAST_PATTERN * noise):
             of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
             found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
+    return found
+
+
+def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]]:
+    """Offsets of outputs in electrons and, beyond chance, the spread of their gains; few outputs tell it roughly."""
+    few = np.sqrt(2 * (taps.offset_dn.size - 1))
+    sigma, (spread, error) = float(taps.offset_dn.std(ddof=1)) / gain, taps.gain_spread
+    found = {"tap_offsets": {"sigma": (sigma, sigma / few)}}
+    if spread > GAINS_THERE * error:
+        found["tap_gains"] = {"spread": (spread, float(np.hypot(spread / few, error)))}
     return found
 
 

@@ -64,6 +64,7 @@ from hsnoise.effects import (
     SharedRowGain,
     ShotNoise,
     Stage,
+    TapGains,
     TapOffsets,
 )
 from hsnoise.model import NoiseModel, sample
@@ -109,6 +110,7 @@ EXAMPLES = [
     ImageLag(0.1),
     OddEvenPattern(1.0, 0.02),
     TapOffsets(2.0, taps=3),
+    TapGains(0.1, taps=3),
     BlackShading(2.0, 0.4),
     AdcNonuniformity(0.4, 8),
     MissingCodes(2.6),
@@ -198,7 +200,7 @@ def test_no_effect_imports_another():
     for path in FOLDER.glob("[a-z]*.py"):
         imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
         own = {node.module for node in imports if node.module.startswith("hsnoise")}
-        base = {f"hsnoise.effects.{name}" for name in ("_base", "_facts", "_parameters")}
+        base = {f"hsnoise.effects.{name}" for name in ("_base", "_facts", "_parameters", "_taps")}
         assert own <= {"hsnoise._core.types", "hsnoise._core.coloured", *base}, path
 
 

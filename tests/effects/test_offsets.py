@@ -20,6 +20,7 @@ from hsnoise.effects import (
     RowFixedPattern,
     RowGroupNoise,
     RowNoise,
+    TapGains,
     TapOffsets,
 )
 from hsnoise.model import NoiseModel, sample_dark
@@ -209,6 +210,8 @@ def test_impossible_settings_are_refused():
         PeriodicBanding(1.0, 0.1, "x")
     with pytest.raises(ValueError, match=r"frame_tilt.axis: expected 'row' or 'column', got 'x'"):
         FrameTilt(1.0, "x")
-    for taps in (1, 2.5):
-        with pytest.raises(ValueError, match=r"tap_offsets.taps: expected a whole number of at least 2"):
+    for taps in (0, 2.5, True, 10**12):
+        with pytest.raises(ValueError, match=r"tap_offsets.taps: expected a whole number from 1 to 65536"):
             TapOffsets(1.0, taps)
+    with pytest.raises(ValueError, match=r"tap_gains.taps: expected at least 2 outputs"):
+        TapGains(0.1, 1)

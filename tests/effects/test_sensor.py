@@ -48,6 +48,7 @@ from hsnoise.effects import (
     RowGroupNoise,
     RowNoise,
     SharedRowGain,
+    TapGains,
     TapOffsets,
 )
 from hsnoise.model import NoiseModel, sample, sample_dark
@@ -61,6 +62,7 @@ PATTERNS = [
     (ColumnFixedPattern(2.0), lambda x: x[0]),
     (DarkSignalNonuniformity(2.0), lambda x: x[0]),
     (TapOffsets(2.0), lambda x: x[0]),
+    (TapGains(0.2, row_taps=2), lambda x: x[0]),
     (PhotoResponseNonuniformity(0.1), lambda x: x[0]),
     (HotPixels(0.1, 1e5), lambda x: x.min(0) > 50),
     (RandomTelegraphNoise(0.1, 5.0, 0.5), lambda x: x.max(0) > x.min(0)),
@@ -140,6 +142,7 @@ NEUTRAL = [
     ImageLag(0.0),
     OddEvenPattern(0.0, 0.0),
     TapOffsets(0.0),
+    TapGains(0.0),
     BlackShading(0.0, 0.4),
     AdcNonuniformity(0.0, 8),
     MissingCodes(1.0),

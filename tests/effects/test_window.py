@@ -22,6 +22,7 @@ from hsnoise.model import NoiseModel, sample
 SENSOR = (48, 96)
 PLACED = [
     TapOffsets(3.0, taps=6),
+    TapOffsets(3.0, taps=3, row_taps=2),
     BlackShading(4.0, 0.1),
     BlackShading(4.0, 0.1, axis="row"),
     OddEvenPattern(2.0),
@@ -37,7 +38,9 @@ def model_of(*effects, cfa="mono"):
 
 
 @pytest.mark.parametrize(
-    "effect", PLACED, ids=["taps", "columns", "rows", "odd-even", "tilted rows", "tilted columns", "groups", "map"]
+    "effect",
+    PLACED,
+    ids=["taps", "quarters", "columns", "rows", "odd-even", "tilted rows", "tilted columns", "groups", "map"],
 )
 @pytest.mark.parametrize(("first", "shape"), [((0, 0), (48, 96)), ((20, 31), (8, 40)), ((47, 0), (1, 96))])
 def test_a_piece_is_cut_out_of_the_sensor(effect, first, shape):

@@ -2,8 +2,8 @@
 
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
 headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
-`_choice`: which of two fits to believe. Here: a gain without growth of signal to support it, frames and pixels that
-measure nothing, and the order of all checks.
+`_taps`: outputs with gains of their own. `_choice`: which of two fits to believe. Here: a gain without growth of signal
+to support it, frames and pixels that measure nothing, and the order of all checks.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._stated import header_gain, stated
+from hsnoise.fitting.doubts._taps import gains_differ, outputs
 from hsnoise.fitting.flat_notes import gain_notes, scattered
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
@@ -68,6 +69,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_moved_pedestals(result),
         *_many_hot(result),
         *curves(result),
+        *gains_differ(result),
         *_scattered_flats(result),
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
@@ -76,6 +78,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         notes = (
             *pixel_notes(result),
             *defects(result),
+            *outputs(result),
             *_of_neighbours(result),
             *_of_narrow(result, found),
             *_of_flats(result),

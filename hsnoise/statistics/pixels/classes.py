@@ -113,13 +113,12 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     limit = hot_from(growth)
     if pixels.n_frames.min() >= FEWEST_FRAMES:
         measuring = [half for half in (0, 1) if pixels.n_frames.min() >= 3 + half]  # two frames at least
+        both = [_Half(pixels.level[:, h], pixels.variance[:, h], pixels.peak[:, h]) for h in (0, 1)]
         parts = [
             _measured(
                 _members(growth[1 - half], _edges(growth[1 - half], limit, True)),
-                pixels.level[:, half],
-                pixels.variance[:, half],
-                pixels.peak[:, half],
-                pixels.level[:, 1 - half],
+                both[half],
+                both[1 - half],
                 t,
                 (pixels.n_frames + 1 - half) // 2 - 1,
                 full_scale_dn,
@@ -134,8 +133,8 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         peak = np.sqrt(np.maximum(pixels.whole_variance, 0) * (pixels.n_frames[:, None] - 1))
         peak = np.where(few, peak, pixels.peak.max(1))
         members = _members(mean, _edges(mean, limit, False))
-        level = pixels.level.mean(1)
-        parts = [_measured(members, level, pixels.whole_variance, peak, level, t, pixels.n_frames - 1, full_scale_dn)]
+        whole = _Half(pixels.level.mean(1), pixels.whole_variance, peak)
+        parts = [_measured(members, whole, whole, t, pixels.n_frames - 1, full_scale_dn)]
         grown = [mean]
     level, variance, error, count, apart = (np.concatenate(x) for x in zip(*[p[:-1] for p in parts], strict=True))
     hot = np.concatenate([[g[m].mean() > limit for m in p[-1]] for g, p in zip(grown, parts, strict=True)])
@@ -222,24 +221,29 @@ def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
     return [inside for inside in np.split(order, bounds) if len(inside) >= FEWEST_PIXELS]
 
 
-def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, full_scale_dn: float):
+class _Half(NamedTuple):
+    """Every pixel in half of the frames, [exposure, pixel]; see `Halves`."""
+
+    level: np.ndarray
+    variance: np.ndarray
+    peak: np.ndarray
+
+
+def _measured(members: list[np.ndarray], found: _Half, other: _Half, t: np.ndarray, dof, full_scale_dn: float):
     """Level, variance, its error [class, exposure], pixels [class], outliers [class, exposure]; the members.
 
-    level, variance, peak [exposure, pixel]: in the measuring frames; other: levels in the choosing frames. dof
-    [exposure]: degrees of freedom of a pixel's variance.
+    found, other: in the measuring and in the choosing frames. dof [exposure]: degrees of freedom of a pixel's variance.
     """
+    level, variance = found.level, found.variance
     size = (len(members), len(level))
     mean, spread, error, apart = np.zeros(size), np.ones(size), np.full(size, np.inf), np.zeros(size)
     ordinary = np.median(level, axis=1)
     floor = np.median(variance, axis=1)
-    scatter, exposures = _level_scatter(members, level, other, t), range(len(level))
+    scatter, exposures = _level_scatter(members, level, other.level, t), range(len(level))
     for c, inside in enumerate(members):
-        bright = (other[:, inside] - ordinary[:, None]).astype(np.float64)
-        calm = [peak[e, inside] < OUTLIER_SIGMAS * _expected_scale(variance[e, inside], bright[e]) for e in exposures]
-        apart[c] = len(inside) - np.sum(calm, axis=1)
-        # The same pixels at all exposures: those that are noisy without signal are outliers there, but no longer beside
-        # its noise, and the signal would seem to have made theirs.
-        kept = np.all(calm, axis=0)
+        bright = (other.level[:, inside] - ordinary[:, None]).astype(np.float64)
+        kept, outliers = _calm(_Half(*(of[:, inside] for of in found)), _Half(*(of[:, inside] for of in other)), bright)
+        apart[c] = outliers.sum(1)
         for e in exposures:
             v, y = variance[e, inside].astype(np.float64), level[e, inside].astype(np.float64)
             mean[c, e] = y[kept].mean() if kept.any() else y.mean()
@@ -256,6 +260,21 @@ def _measured(members: list[np.ndarray], level, variance, peak, other, t, dof, f
     lost = ~np.isfinite(mean)
     mean[lost], spread[lost] = 0.0, 1.0
     return mean, spread, error, np.array([len(m) for m in members], float), apart, members
+
+
+def _calm(found: _Half, other: _Half, bright: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels of a class count [pixel], the same at all exposures, and which are outliers [exposure, pixel].
+
+    Pixels that are noisy in the choosing frames do not count: without signal they are outliers, beside its noise they
+    are not, and the signal would seem to have made theirs. In the measuring frames only those do not that are far off
+    for the pixel itself: a cut that is closer at some exposures than at others would do the same.
+
+    bright [exposure, pixel]: level above that of ordinary pixels, in the choosing frames.
+    """
+    limit = OUTLIER_SIGMAS * np.stack([_expected_scale(v, of) for v, of in zip(found.variance, bright, strict=True)])
+    own = np.sqrt(np.maximum(np.nan_to_num(other.variance), 0))  # NaN of single frames
+    kept = (other.peak < limit) & (found.peak < np.maximum(limit, OUTLIER_SIGMAS * own))
+    return kept.all(0), found.peak >= limit
 
 
 def _chance_error(variance: np.ndarray, excess: np.ndarray, floor: float, dof: int) -> float:
@@ -280,7 +299,7 @@ def _expected_scale(variance: np.ndarray, excess: np.ndarray) -> np.ndarray:
     middle = max(float(np.median(excess)), 1e-6)
     brighter = np.maximum(excess / middle, 1.0) if middle > LEAST_SCALE_DN else 1.0
     usual = max(float(np.median(variance)), 0.0)  # saturated pixels may fall below 0 after subtraction
-    return np.maximum(np.sqrt(usual * brighter), LEAST_SCALE_DN)
+    return np.maximum(np.sqrt(usual * np.broadcast_to(brighter, excess.shape)), LEAST_SCALE_DN)
 
 
 def _level_scatter(members: list[np.ndarray], level, other, t) -> np.ndarray:

@@ -112,7 +112,10 @@ class Group:
 
 @dataclass(frozen=True)
 class Survey:
-    """The result of one pass over a stack: its groups, the rows [row] of the sampled pixels, and the shape."""
+    """The result of one pass over a stack: its groups, the rows [row] of the sampled pixels, and the shape.
+
+    is_whole: whether the frames are not known to be a part of a sensor's.
+    """
 
     groups: tuple[Group, ...]
     channels: tuple[str, ...]
@@ -120,6 +123,7 @@ class Survey:
     sampled_rows: np.ndarray
     shape: tuple[int, int]
     full_scale_dn: float
+    is_whole: bool
 
     def stuck(self, channel: int) -> np.ndarray:
         """Sampled pixels of a channel [pixel] with the same count in all frames of the noisy groups."""
@@ -175,7 +179,8 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
         groups.append(group)
         highest = max(highest, top)
     full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
-    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full)
+    is_whole = stack.window is None or tuple(stack.window[2:]) == stack.shape
+    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full, is_whole)
 
 
 def _full_scale(highest: int) -> float:

@@ -1,0 +1,46 @@
+"""Outputs that read blocks of the frame: what they are, and that numbers of the table are means over them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hsnoise.fitting.result import FitResult
+from hsnoise.statistics.pixels.taps import Taps
+
+DIFFER = 0.02  # largest relative difference of gains that is no doubt
+
+
+def gains_differ(result: FitResult) -> Iterator[str]:
+    """That no pixel may have the gain of the table."""
+    taps = _taps(result)
+    if taps is not None and "tap_gains" in result.added and np.ptp(taps.gain) > DIFFER:
+        rows, columns = (n // of for n, of in zip(result.summary.shape, (taps.rows, taps.columns), strict=True))
+        yield (
+            f"{_outputs(taps)}, and their gains differ: {_listed(taps.gain, '.3f')} of the mean"
+            f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are means;"
+            f" --roi 0:{rows},0:{columns}, or stack.select, fits the first output alone."
+        )
+
+
+def outputs(result: FitResult) -> Iterator[str]:
+    """Offsets and noise of each output."""
+    taps = _taps(result)
+    if taps is not None:
+        yield (
+            f"{_outputs(taps)}: offsets of {_listed(taps.offset_dn, '+.3g')} DN, noise of"
+            f" {_listed(taps.noise_dn, '.3g')} DN."
+        )
+
+
+def _taps(result: FitResult) -> Taps | None:
+    return None if result.transfer is None else result.transfer.taps
+
+
+def _outputs(taps: Taps) -> str:
+    return f"{taps.rows} x {taps.columns} outputs read blocks of the frame (rows x columns)"
+
+
+def _listed(values: np.ndarray, form: str) -> str:
+    return "; ".join(", ".join(format(value, form) for value in row) for row in values)

@@ -1,0 +1,174 @@
+"""Blocks of the frame that separate outputs read: sharp steps of level or noise at halves, quarters, eighths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise.statistics.pixels.sample import without_outliers
+from hsnoise.statistics.pixels.survey import Group, Plane, Survey
+
+LAYOUTS = {0: (2,), 1: (2, 4, 8, 16)}  # outputs over the rows, over the columns
+SEAM = 8.0  # typical differences between neighbouring runs of lines
+REACH, LEAST_REACH = 16, 4  # lines on each side of a seam
+FEWEST_PLACES = 24  # elsewhere, which tell the typical difference
+MOST = 0.6  # share of the new seams of a layout that must be there
+FILLED = 0.7  # of full scale: above it the response may bend
+LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
+
+Bounds = list[tuple[int, int]]
+
+
+class Taps(NamedTuple):
+    """Outputs that read blocks of the frame.
+
+    Attributes:
+        rows, columns: number of blocks over the rows and over the columns.
+        offset_dn [block row, block column]: level without signal less its mean, DN.
+        noise_dn: temporal noise of the typical pixel without signal, DN.
+        gain, gain_error: relative to the mean of the outputs, by the variance that signal adds; NaN without signal.
+    """
+
+    rows: int
+    columns: int
+    offset_dn: np.ndarray
+    noise_dn: np.ndarray
+    gain: np.ndarray
+    gain_error: np.ndarray
+
+    def of_lines_dn(self, axis: str, lines: int) -> np.ndarray:
+        """Mean offset of each of the rows or columns of a plane [line], DN."""
+        blocks = self.offset_dn.mean(1 if axis == "row" else 0)
+        return blocks[np.arange(lines) * len(blocks) // lines]
+
+    @property
+    def gain_spread(self) -> tuple[float, float]:
+        """Standard deviation of the logarithm of gain over the outputs, and its standard error; infinite if unknown."""
+        if np.isnan(self.gain).any():
+            return 0.0, np.inf
+        logarithm, error_2 = np.log(self.gain), np.mean((self.gain_error / self.gain) ** 2)
+        spread = float(np.sqrt(max(logarithm.var(ddof=1) - error_2, 0.0)))
+        return spread, float(np.sqrt(error_2 / (self.gain.size - 1)))
+
+
+def taps_of(found: Survey) -> Taps | None:
+    """The outputs of a sensor, from its shortest darks of several frames; None if there is one, or nothing tells."""
+    group = found.shortest
+    if group is None or not found.is_whole:
+        return None
+    level, noise = _map(group, "level_dn"), np.log(np.maximum(_map(group, "pair_variance_dn2"), 1e-6))
+    rows, columns = (max(_layout(of, axis, found) for of in (level, noise)) for axis in (0, 1))
+    if rows * columns == 1:
+        return None
+    bounds = [_bounds(found, axis, count) for axis, count in enumerate((rows, columns))]
+    offset, variance, _ = _moments(group, bounds)
+    offset -= offset.mean()
+    return Taps(rows, columns, offset, np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds))
+
+
+def levelled(found: Survey, taps: Taps) -> Survey:
+    """The survey with the offsets of outputs subtracted from the static rows and columns of its shortest darks."""
+    shortest = found.shortest
+    groups = [
+        replace(g, planes=tuple(_levelled(p, taps) for p in g.planes)) if g is shortest else g for g in found.groups
+    ]
+    return replace(found, groups=tuple(groups))
+
+
+def _levelled(plane: Plane, taps: Taps) -> Plane:
+    means, components = {}, dict(plane.components)
+    for axis in ("row", "column"):
+        before = getattr(plane, f"{axis}_mean_dn")
+        after = before - taps.of_lines_dn(axis, len(before))
+        means[f"{axis}_mean_dn"], one = after, components[axis]
+        less = float(before.var(ddof=1) - after.var(ddof=1))
+        components[axis] = replace(one, variance_dn2=one.variance_dn2 - less)
+    return replace(plane, components=components, **means)
+
+
+def _map(group: Group, name: str) -> np.ndarray:
+    """A statistic of the sampled pixels, mean over halves of the frames and over planes [row, column] of a plane."""
+    maps = []
+    for plane in group.planes:
+        values = getattr(plane.halves, name).reshape(-1, plane.halves.lowest.size).mean(0, dtype=np.float64)
+        maps.append(values.reshape(-1, len(plane.column_mean_dn)))
+    return np.mean(maps, axis=0)
+
+
+def _bounds(found: Survey, axis: int, count: int) -> Bounds:
+    """First and last line of each block among the sampled lines of a plane."""
+    step = 1 if found.cfa == "mono" else 2
+    lines = found.sampled_rows[::step] if axis == 0 else np.arange(0, found.shape[1], step)
+    edges = np.searchsorted(lines, [of * found.shape[axis] / count for of in range(count + 1)])
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _layout(values: np.ndarray, axis: int, found: Survey) -> int:
+    """Number of outputs along an axis: the most whose new seams are mostly there."""
+    half = values.shape[1 - axis] // 2
+    # Two halves across: the offsets of outputs may cancel in their mean.
+    parts = np.split(values, [half], axis=1 - axis)
+    profiles = [np.median(of, axis=1 - axis) for of in parts]
+    most = 1
+    for count in LAYOUTS[axis]:
+        edges = [start for start, _ in _bounds(found, axis, count)[1:]]
+        new = edges[::2] if count > 2 else edges  # the others are those of half as many outputs
+        there = [any(_is_seam(profile, edge, edges) for profile in profiles) for edge in new]
+        if np.mean(there) >= MOST:
+            most = count
+    return most
+
+
+def _is_seam(profile: np.ndarray, edge: int, edges: Iterable[int]) -> bool:
+    """Whether lines on both sides of an edge differ by more than anywhere else, and most at the edge itself."""
+    gaps = np.diff([0, *edges, len(profile)])
+    reach = min(REACH, int(gaps.min()) // 4)
+    if reach < LEAST_REACH:
+        return False
+    sums = np.concatenate([[0.0], np.cumsum(profile)])
+    at = np.arange(reach, len(profile) - reach + 1)
+    steps = (sums[at + reach] - 2 * sums[at] + sums[at - reach]) / reach
+    elsewhere = steps[np.all([np.abs(at - one) > reach for one in edges], axis=0)]
+    if len(elsewhere) < FEWEST_PLACES:
+        return False
+    middle = float(np.median(elsewhere))
+    typical = 1.4826 * float(np.median(np.abs(elsewhere - middle)))
+    here = np.abs(steps - middle)
+    near = np.abs(at - edge) <= reach
+    return bool(here[at == edge][0] > SEAM * typical and np.abs(at[near][here[near].argmax()] - edge) <= 1)
+
+
+def _gains(found: Survey, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray]:
+    """Gains of blocks relative to their mean, by the variance that signal adds, and errors; weighted means."""
+    ratios, errors = [], []
+    level, variance, chance = _moments(found.shortest, bounds)
+    for group in found.groups:
+        if group.n_frames < 2 or group is found.shortest:
+            continue
+        brighter, noisier, of_it = _moments(group, bounds)
+        signal, added = brighter - level, noisier - variance
+        if (signal <= 0).any() or brighter.max() > FILLED * found.full_scale_dn:
+            continue
+        if added.mean() > LEAST_SIGNAL * variance.mean():
+            mean = float(np.mean(added / signal))
+            ratios.append(added / signal / mean)
+            errors.append(np.hypot(of_it, chance) / signal / mean)
+    if not ratios:
+        return np.full_like(level, np.nan), np.full_like(level, np.nan)
+    weight = np.array(errors) ** -2.0
+    return (weight * ratios).sum(0) / weight.sum(0), weight.sum(0) ** -0.5
+
+
+def _moments(group: Group, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Level of the typical pixel, mean variance without outliers, and its error, of each block."""
+    variance = _map(group, "pair_variance_dn2")
+    both = [
+        [without_outliers(variance[r0:r1, c0:c1].ravel(), group.n_frames) for c0, c1 in bounds[1]]
+        for r0, r1 in bounds[0]
+    ]
+    level = _map(group, "level_dn")
+    typical = [[float(np.median(level[r0:r1, c0:c1])) for c0, c1 in bounds[1]] for r0, r1 in bounds[0]]
+    return np.array(typical), *np.moveaxis(np.array(both), 2, 0)

@@ -1,0 +1,88 @@
+"""Outputs that read blocks of the frame, found and measured by fits that follow each pixel; frames by NumPy alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+
+SHAPE, FRAMES = (120, 256), 8
+
+
+def blocks(values):
+    """Values [block row, block column] of each pixel."""
+    values = np.asarray(values)
+    row, column = (np.arange(n) * of // n for n, of in zip(SHAPE, values.shape, strict=True))
+    return values[row[:, None], column]
+
+
+def camera(gains, offsets, rng, *, light=(), exposures=(0.0,), cfa="mono", more=0.0):
+    """Darks of some exposures and flats of a sensor with 8 e- of read noise and pixels that differ."""
+    gain, offset = blocks(gains), blocks(offsets) + rng.normal(0, 0.5, SHAPE) + more
+    dark, response = rng.lognormal(0, 0.5, SHAPE), 1 + 0.01 * rng.standard_normal(SHAPE)
+
+    def frames(signal, n):
+        electrons = rng.poisson(np.broadcast_to(signal, (n, *SHAPE))) + 8 * rng.standard_normal((n, *SHAPE))
+        return np.round(500 + offset + gain * electrons).astype(np.uint16)
+
+    counts = [frames(dark * t, FRAMES) for t in exposures] + [frames(response * e, 2) for e in light]
+    kind = ["dark"] * len(exposures) + ["flat"] * len(light)
+    return hsnoise.FrameStack(counts, [*exposures, *[1.0] * len(light)], kind=kind, cfa=cfa)
+
+
+QUARTERS = [[0.80, 0.92], [0.68, 0.84]]
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        {"light": (2000, 8000)},
+        pytest.param({"exposures": (0.0, 30.0, 300.0)}, marks=pytest.mark.slow),
+        pytest.param({"light": (2000, 8000), "cfa": "RGGB"}, marks=pytest.mark.slow),
+    ],
+    ids=["flats", "darks", "Bayer"],
+)
+def test_the_gain_of_each_quarter(known, rng):
+    fit = hsnoise.fit(camera(QUARTERS, [[0, 20], [-20, 10]], rng, **known))
+    taps, truth = fit.transfer.taps, np.array(QUARTERS) / np.mean(QUARTERS)
+    assert (taps.rows, taps.columns) == (2, 2)
+    assert (np.abs(taps.gain - truth) < 4 * taps.gain_error).all() and taps.gain_error.max() < 0.03
+    assert np.abs(taps.offset_dn - [[-2.5, 17.5], [-22.5, 7.5]]).max() < 1.0  # of the dark signal, where there is some
+    assert {"tap_offsets", "tap_gains"} <= set(fit.added)
+    assert not {"row_fixed_pattern", "column_fixed_pattern", "black_shading"} & set(fit.added)
+    assert (fit.params["tap_gains"].taps, fit.params["tap_gains"].row_taps) == (2, 2)
+    doubt = next(one for one in fit.doubts if "gains differ" in one)
+    assert doubt.startswith("2 x 2 outputs") and "--roi 0:60,0:128" in doubt
+
+
+def test_outputs_that_are_alike_but_for_offsets_are_no_doubt(rng):
+    """Beside columns that differ, too."""
+    columns = rng.normal(0, 0.5, (1, SHAPE[1]))
+    fit = hsnoise.fit(camera([[0.8] * 4], [[0, 6, -4, 3]], rng, light=(2000, 8000), more=columns))
+    assert "tap_offsets" in fit.added and "tap_gains" not in fit.added
+    assert not any("outputs" in doubt for doubt in fit.doubts)
+    assert any(note.startswith("1 x 4 outputs read blocks") for note in fit.notes)
+    value, error, _ = fit.table["column_fixed_pattern.sigma"]
+    assert abs(value - columns.std() / 0.8) < 4 * error
+
+
+@pytest.mark.parametrize("more", ["drift", "columns", "step elsewhere", "nothing"])
+def test_one_output_has_no_seam(more, rng):
+    column = np.arange(SHAPE[1])
+    shapes = {
+        "drift": 30 * np.exp(-column / 40),
+        "columns": rng.normal(0, 5, SHAPE[1]),
+        "step elsewhere": 10.0 * (column > 140),
+        "nothing": 0.0 * column,
+    }
+    fit = hsnoise.fit(camera([[0.8]], [[0.0]], rng, more=shapes[more]), pixels="differ")
+    assert fit.transfer.taps is None
+
+
+@pytest.mark.parametrize("window", [None, (0, 40, *SHAPE)], ids=["unknown", "known"])
+def test_a_part_of_the_sensor_has_no_halves(window, rng):
+    whole = camera(QUARTERS, [[0, 20], [-20, 10]], rng)
+    part = whole.select(rows=(0, 100), columns=(40, 192) if window is None else (40, 216))
+    stack = part if window is None else part.with_counts(part.counts, window)
+    assert hsnoise.fit(stack, pixels="differ").transfer.taps is None
