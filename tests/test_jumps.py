@@ -95,5 +95,6 @@ def test_a_fit_adds_them_and_takes_neither_their_noise_nor_their_share_for_that_
     value, error, _ = result.table["random_telegraph_noise.fraction"]
     assert abs(value - 0.03) < 4 * error
     # Those that jump by less than the noise stay among the classes of pixels.
-    for name, true in {"gain": 1.0, "read_noise.sigma": NOISE_DN, "dark_current.rate": 3.0}.items():
+    rate = 3.0 * np.exp(0.5**2 / 2)
+    for name, true in {"gain": 1.0, "read_noise.sigma": NOISE_DN, "dark_current.rate": rate}.items():
         assert abs(result.table[name][0] / true - 1) < 0.1, name

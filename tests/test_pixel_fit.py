@@ -284,6 +284,21 @@ def test_pixels_that_are_noisier_than_others_do_not_pass_for_signal(shape, rng):
     fit = hsnoise.fit(np.round(darks).clip(0).astype(np.uint16), exposure_s=exposures)
     value, error, _ = fit.table["gain"]
     assert abs(value - gain) < 3.5 * error < 0.1 * gain
+    value, error, _ = fit.table["read_noise_nonuniformity.tail"]
+    assert abs(value - 0.35) < 4 * np.hypot(error, 0.35 / np.sqrt(sigma.size))
+    value, error, _ = fit.table["read_noise.sigma"]
+    rms = np.sqrt((sigma**2).mean())  # without the noisiest few percent, which pass for outliers, 0.84 of it
+    assert abs(value - rms) < 3.5 * error < 0.1 * rms
+    assert not any("far noisier" in doubt or "outlier" in doubt for doubt in fit.doubts)
+
+
+@pytest.mark.parametrize("spread", [0.15, pytest.param(0.4, marks=pytest.mark.slow)])
+def test_log_normal_noise_has_no_tail(spread, rng):
+    shape = (160, 200)
+    sigma = 5 * np.exp(spread * rng.standard_normal(shape) - spread**2)
+    darks = np.round(100 + 8 * rng.standard_normal(shape) + sigma * rng.standard_normal((2, 8, *shape)))
+    fit = hsnoise.fit(darks.clip(0).astype(np.uint16), exposure_s=(0.001, 0.01), pixels="differ")
+    assert fit.params["read_noise_nonuniformity"].tail == 0
 
 
 def test_a_few_wild_counts_move_nothing(rng):

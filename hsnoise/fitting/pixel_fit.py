@@ -30,7 +30,7 @@ from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
 from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
-from hsnoise.statistics.pixels.read_noise import NoiseSpread, noise_spread_of
+from hsnoise.statistics.pixels.read_noise import NoiseSpread, Tail, noise_spread_of, tail_of
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
@@ -41,6 +41,7 @@ from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfe
 
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
+RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
@@ -138,6 +139,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     jumps, jumping = jumps_of(found, c) if narrow is None else (None, None)
+    tail = tail_of(found, c) if narrow is None and jumps is None else None
     raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
     floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
     # Rounding, not light, sets the variance of narrow noise.
@@ -148,16 +150,20 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     transfer = None if pixels is None else _transfer(pixels, found, row_gain(growth))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
+    if tail is not None:
+        _raise(values, covariance, tail)
+    without, of_without = (1.0, values[1]), covariance[1, 1]
     if transfer is not None and pixels is not None:
         values, covariance = transfer.values.copy(), transfer.covariance.copy()
         if jumps is not None:
             _correct(values, covariance, jumps, raised)
+        if tail is not None:
+            _raise(values, covariance, tail)
         population = _population(found, c, pixels, transfer)
         values[2] = population.mean
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
             # If ordinary pixels do not grow, hot ones only give a bound.
-            values[:2] = 1.0, floor
-            covariance = np.diag([UNKNOWN**2, floor_error**2, covariance[2, 2]])
+            values[:2], covariance = without, np.diag([UNKNOWN**2, of_without, covariance[2, 2]])
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
@@ -182,7 +188,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=spectrum,
-        noise_spread=_noise_spread(found, c, float(values[1]), jumps) if narrow is None else UNKNOWN_SPREAD,
+        noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if narrow is None else UNKNOWN_SPREAD,
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=_rays(found, c) if narrow is None else None,
@@ -205,8 +211,18 @@ def _correct(values: np.ndarray, covariance: np.ndarray, jumps: Jumps, raised: f
     covariance[0, 0] += (UNSEEN * (raised - 1) * values[0]) ** 2
 
 
-def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None) -> NoiseSpread:
-    return noise_spread_of(found, c, read_dn2, None if jumps is None else jumps.noise_spread)
+def _raise(values: np.ndarray, covariance: np.ndarray, tail: Tail) -> None:
+    """Adds the noise of the noisiest pixels, which were left out, and to the error a tenth of it."""
+    more = (tail.raised - 1) * max(values[1] - ROUNDING, 0.0)
+    values[1] += more
+    covariance[1, 1] += (RAISED_BY * more) ** 2
+
+
+def _noise_spread(found: Survey, c: int, read_dn2: float, jumps: Jumps | None, tail: Tail | None) -> NoiseSpread:
+    of_pixels = None if jumps is None else jumps.noise_spread
+    if tail is None:
+        return noise_spread_of(found, c, read_dn2, of_pixels)
+    return noise_spread_of(found, c, read_dn2, tail.spread)._replace(tail=tail.value)
 
 
 def _rays(found: Survey, c: int) -> Rays | None:

@@ -199,8 +199,8 @@ def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, 
 
 def _noise_spread(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
     """Read noise that differs between pixels, rows or columns: means over the colours."""
-    differs, *of_lines = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
-    lines = {name: of for name, of in zip(("row_spread", "column_spread"), of_lines, strict=True) if of[0] > 0}
+    differs, *others = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
+    lines = {name: of for name, of in zip(("row_spread", "column_spread", "tail"), others, strict=True) if of[0] > 0}
     is_there = lines or differs[0] > max(THERE * differs[1], LEAST_NOISE_SPREAD)
     return {"read_noise_nonuniformity": {"spread": differs, **lines}} if is_there else {}
 

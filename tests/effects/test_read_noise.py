@@ -77,6 +77,16 @@ def test_nonuniform_read_noise_is_log_normal_over_pixels_of_the_same_rms():
     assert abs(np.mean(one**4) - 3 * frames / (frames + 2)) < 5 * np.sqrt(96 / one.size)
 
 
+def test_a_tail_of_noisy_pixels_is_exponential_and_leaves_the_rms():
+    frames, tail = 2000, 0.2
+    drawn = darks(frames, (60, 60), ReadNoiseNonuniformity(0.0, tail=tail), ReadNoise(3.0))
+    variance = np.mean(drawn**2, 0).ravel()
+    above = np.log(variance) / 2 - np.log(3.0 * np.sqrt(1 - 2 * tail))
+    # The chance of 2000 frames moves a logarithm by 0.016, which shows at the sharp edge alone.
+    assert stats.kstest(above[above > 0.1] - 0.1, "expon", args=(0, tail)).pvalue > P_VALUE
+    assert abs(variance.mean() - 9) < 5 * variance.std() / np.sqrt(variance.size)
+
+
 def correlations(drawn, lags):
     """Correlation of pixels so far apart in their row [lag], and its error by chance."""
     found = [np.mean(drawn[:, :, lag:] * drawn[:, :, : drawn.shape[2] - lag]) for lag in lags]

@@ -61,7 +61,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *alone,
         *header_gain(result),
         *order_note(result),
-        *pixels_apart(found, "random_telegraph_noise" in result.params),
+        *pixels_apart(found, _has_noisy_pixels(result)),
         *of_signal,
         *lit_darks(found),
         *moved,
@@ -260,10 +260,16 @@ def _many_hot(result: FitResult) -> Iterator[str]:
         )
 
 
+def _has_noisy_pixels(result: FitResult) -> bool:
+    """Whether an effect of the model draws pixels that are far noisier than others."""
+    of = result.params["read_noise_nonuniformity"] if "read_noise_nonuniformity" in result.params else None
+    return "random_telegraph_noise" in result.params or (of is not None and float(of.tail) > 0)
+
+
 def _outliers(result: FitResult) -> Iterator[str]:
     """Pixels that were excluded because of an outlier in some frame."""
     pixel = result.transfer
-    for channel in pixel.channels if pixel is not None else ():
+    for channel in pixel.channels if pixel is not None and not _has_noisy_pixels(result) else ():
         share = 0.0 if channel.transfer is None else float(channel.transfer.classes.outlier_share.max())
         if share > MANY_OUTLIERS:
             of = "" if channel.name == "mono" else f" of {channel.name}"

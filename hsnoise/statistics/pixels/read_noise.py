@@ -6,18 +6,22 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import digamma
 
+from hsnoise.statistics.pixels.classes import is_hot
 from hsnoise.statistics.pixels.sample import covariance_of, is_no_outlier, without_outliers
 from hsnoise.statistics.pixels.structure import covariance_terms
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_PIXELS = 1000
-MOSTLY_READ = 1.2  # largest ratio of the variances of two exposures
+MOSTLY_READ, ALL_READ = 1.2, 1.03  # largest ratios of the variances of two exposures
 TINY_DN2, OUTLYING = 1e-6, 6.0  # the last: times the median variance of a line
 SURE = 8.0  # standard errors above which quiet pixels differ: telegraph noise that is not cut reaches 5
 NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
 FEWEST_LINES, LINES_THERE, LEAST_OF_LINES = 32, 6.0, 0.01  # the last: spread of rows or columns that matters
+MOST_OF_SPREAD = 0.6  # of the deviation of ln sigma that a tail must make: rounding skews log-normal noise by a third
+MOST_TAIL = 0.44
 BESIDE_LINES = 0.5  # of their spread: a smaller one of pixels is what the difference of two nearly equal ones leaves
 
 Number = tuple[float, float]
@@ -26,12 +30,61 @@ Number = tuple[float, float]
 class NoiseSpread(NamedTuple):
     """Standard deviation of the logarithm of read noise over single pixels, whole rows and whole columns, with errors.
 
-    What rows and columns share is not in that of pixels. An error is infinite where nothing is determined.
+    What rows and columns share is not in that of pixels. tail: mean of an exponential part of it over pixels. An error
+    is infinite where nothing is determined.
     """
 
     pixels: Number
     rows: Number = (0.0, np.inf)
     columns: Number = (0.0, np.inf)
+    tail: Number = (0.0, np.inf)
+
+
+class Tail(NamedTuple):
+    """Pixels that are far noisier than log-normal ones: ln sigma = constant + spread z + value E, E exponential.
+
+    raised: variance of all pixels over that of those that pass for no outliers.
+    """
+
+    value: Number
+    spread: Number
+    raised: float
+
+
+def tail_of(found: Survey, channel: int) -> Tail | None:
+    """The noisiest pixels of a channel, where there are more of them than log-normal noise has; None where not.
+
+    From cumulants of the logarithm of read noise L over pixels: two temporal variances of a pixel have errors that are
+    independent of it and of each other, so their logarithms a, b give the second as the mean of ab / 4 and the third as
+    that of a^2 b / 8, which is 2 tail^3. Pixels that are hit, or jump once, are noisy in one of them only.
+    """
+    groups = sorted(found.repeated_darks, key=lambda g: g.exposure_s)
+    kept = ~found.stuck(channel) & ~is_hot(found, channel) if groups else np.zeros(0, bool)
+    if kept.sum() < FEWEST_PIXELS:
+        return None
+    noise = [float(np.median(g.pixels(channel, "pair_variance_dn2"))) for g in groups[:2]]
+    # Shot noise, which pixels share, would make the logarithms differ by less.
+    both, frames = _variances(groups if noise[-1] < ALL_READ * noise[0] else groups[:1], channel, kept)
+    both = both[:, (both > TINY_DN2).all(0)].astype(np.float64)
+    if min(frames) < 2 or both.shape[1] < FEWEST_PIXELS:
+        return None
+    a, b = (of - of.mean() for of in np.log(both))
+    second, third = a * b / 4, (a + b) * a * b / 16
+    error = float(third.std() / np.sqrt(len(a)))
+    value = float(np.cbrt(max(third.mean(), 0.0) / 2))
+    square, of_square = float(second.mean()), float(second.std() / np.sqrt(len(a)))
+    if third.mean() < SURE * error or value < MOST_OF_SPREAD * np.sqrt(max(square, 0.0)):
+        return None
+    value = min(value, MOST_TAIL)
+    spread = np.sqrt(max(square - value**2, 0.0))
+    of_value = error / (6 * value**2)
+    # The mean square, from the mean logarithm, which the logarithm of a chi-square moves.
+    dof = frames[0] - 1
+    typical = np.exp(np.log(both[0]).mean() - digamma(dof / 2) + np.log(dof / 2))
+    whole = typical * np.exp(2 * (spread**2 - value)) / (1 - 2 * value)
+    raised = max(float(whole / without_outliers(both[0], frames[0])[0]), 1.0)
+    of_spread = np.hypot(of_square, 2 * value * of_value) / (2 * max(spread, np.sqrt(of_square)))
+    return Tail((value, float(of_value)), (float(spread), float(of_spread)), raised)
 
 
 def noise_spread_of(found: Survey, channel: int, read_dn2: float, of_pixels: Number | None) -> NoiseSpread:
