@@ -34,7 +34,13 @@ from hsnoise.statistics.pixels.read_noise import NoiseSpread, Tail, noise_spread
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
-from hsnoise.statistics.pixels.structure import beside_neighbours, double_differences, low_side_sigma, plane_rows
+from hsnoise.statistics.pixels.structure import (
+    beside_neighbours,
+    double_differences,
+    low_side_sigma,
+    of_blocks,
+    plane_rows,
+)
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
@@ -44,6 +50,7 @@ MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps 
 RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
+LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
 
@@ -267,8 +274,8 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
 def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) -> tuple[float, float]:
     """Relative standard deviation of the pixels' response to light (PRNU), and its error, from 2 x 2 blocks.
 
-    From the flats that do not saturate; dust and vignetting hardly vary within a block. Without any, the error is
-    infinite.
+    From the flats that do not saturate; dust and vignetting hardly vary within a block, whose own signal counts.
+    Without any, the error is infinite.
     """
     several = []
     for group in found.groups:
@@ -279,9 +286,12 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
         if signal <= 0 or (highest == highest.max()).mean() > MOST_SATURATED:
             continue
         rows = len(found.sampled_rows) * plane_rows(found)
-        blocks = np.concatenate([double_differences(p.halves.level_dn, rows) for p in group.of(c)], axis=1)
-        sigma, error = offset_sigma(blocks, offset_dn, np.inf)
-        several.append((sigma / signal, max(error / signal, 1e-9)))
+        levels = [p.halves.level_dn for p in group.of(c)]
+        blocks = np.concatenate([double_differences(of, rows) for of in levels], axis=1)
+        here = np.concatenate([of_blocks(of.mean(0), rows) for of in levels]) - black_dn
+        lit = here > LEAST_LIT * signal
+        sigma, error = offset_sigma(blocks[:, lit] / here[lit], offset_dn / signal, np.inf)
+        several.append((sigma, max(error, 1e-9)))
     return weighted_mean(several) if several else (0.0, np.inf)
 
 

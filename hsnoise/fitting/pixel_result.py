@@ -385,6 +385,7 @@ def _covariance(
     apart |= {(effect, field): error for effect, fields in population.items() for field, (_, error) in fields.items()}
     errors = {n.name: float(np.asarray(apart[n.place])[n.index]) for n in numbers if n.place in apart}
     errors = {name: error for name, error in errors.items() if np.isfinite(error)}
+    errors = {name: error if error < UNKNOWN else np.inf for name, error in errors.items()}
     covariance = np.diag([*np.zeros(len(joint)), *np.square(list(errors.values()))])
     together = slice(len(joint))
     whole = pixel.covariance if pixel.determined else _without_gain(pixel, params)

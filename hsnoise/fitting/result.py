@@ -199,12 +199,11 @@ class FitResult:
     def _times_gain(self, name: str) -> tuple[float, float, str]:
         """A row in DN, by the gain that `params` has; what depends on the gain is known better in DN."""
         gain, (value, error, unit) = float(np.mean(np.asarray(self.params["gain"].value))), self._rows[name]
-        slope = np.zeros(len(self.names))
         gains = [i for i, one in enumerate(self.names) if one in self.rows_of("gain")]
         if name in self.names and self.covariance[self.names.index(name), gains].any():
-            slope[gains] = value / len(gains)
-            slope[self.names.index(name)] = gain
-            error = float(np.sqrt(max(slope @ self.covariance @ slope, 0.0))) / gain
+            some = [*gains, self.names.index(name)]
+            slope = np.array([*[value / len(gains)] * len(gains), gain])
+            error = float(np.sqrt(max(slope @ self.covariance[np.ix_(some, some)] @ slope, 0.0))) / gain
         return value * gain, error * gain, unit.replace("e-", "DN")
 
     @property

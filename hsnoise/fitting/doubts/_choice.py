@@ -11,7 +11,14 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_result import result_of
 from hsnoise.fitting.result import FitResult, Method, Status
-from hsnoise.statistics.pixels.structure import can_be_transferred, fall_of, full_of_hits, has_patterns, variance_grows
+from hsnoise.statistics.pixels.structure import (
+    can_be_transferred,
+    fall_of,
+    full_of_hits,
+    has_patterns,
+    responses_differ,
+    variance_grows,
+)
 
 APART_SIGMAS, APART_SHARE = 5.0, 0.05  # standard errors and share by which two gains differ
 
@@ -27,7 +34,9 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
         return False
     if not found.has_exposures:
         # A likelihood adds nothing where flats give the gain, or bias frames none, and rows of real sensors bias it.
-        return (summary.flats is not None or not summary.exposure_s.any()) and has_patterns(found)
+        if summary.flats is not None:
+            return has_patterns(found) or responses_differ(found)
+        return not summary.exposure_s.any() and has_patterns(found)
     fell = fall_of(found) is not None  # pedestals that jump this far look like a signal
     if variance_grows(found) and not fell:
         return False
@@ -37,15 +46,17 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
 def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
     """The pooled fit, or pixel transfer if pixels over time contradict that fit or it did not converge."""
     found, summary = seen.survey, seen.summary
-    if summary.flats is not None or not can_be_transferred(found) or not found.has_exposures or full_of_hits(found):
+    failed = result.status == Status.LINE_INSTEAD
+    if not can_be_transferred(found) or full_of_hits(found) or (result.method == Method.LINE and not failed):
         return result
-    pixel = seen.darks
+    if not failed and (summary.flats is not None or not found.has_exposures):
+        return result
+    pixel = seen.measured(found) if failed else seen.darks
     if not pixel.determined:
         return result
     other = partial(result_of, pixel, summary, model, result.stack)
-    if result.method == Method.LINE:
-        failed = result.status == Status.LINE_INSTEAD
-        return replace(other(), status=Status.TRANSFER_INSTEAD, detail=result.detail) if failed else result
+    if failed:
+        return replace(other(), status=Status.TRANSFER_INSTEAD, detail=result.detail)
     gain, error = np.asarray(result.params["gain"].value), _gain_errors(result)
     off = np.abs(gain - pixel.estimate[: len(gain)])
     apart = off > np.maximum(APART_SIGMAS * np.hypot(error, _errors(pixel)), APART_SHARE * gain)

@@ -36,7 +36,7 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
     chosen = _chosen(found)
     if any(plane.narrow_dn is not None for i in chosen for plane in found.groups[i].planes):
         return  # rounding dominates noise below a count, and affects the two unequally
-    drawn = _drawn(result.params, result.stack, [found.groups[i].exposure_s for i in chosen])
+    drawn = _drawn(_without_outputs(result.params), result.stack, [found.groups[i].exposure_s for i in chosen])
     pairs = [(found.groups[i], group) for i, group in zip(chosen, drawn.groups, strict=True)]
     for c, channel in enumerate(found.channels):
         of = "" if channel == "mono" else f" of {channel}"
@@ -44,6 +44,13 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
             _, sentence = max(differences(pairs, c, of), default=(0.0, ""))
             if sentence:
                 yield sentence
+
+
+def _without_outputs(model: NoiseModel) -> NoiseModel:
+    """The model as if one output read the frame: others are drawn at random for every sensor of the make."""
+    for name in ("tap_offsets", "tap_gains"):
+        model = model.remove(name) if name in model else model
+    return model
 
 
 def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Survey:

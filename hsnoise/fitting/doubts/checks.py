@@ -22,7 +22,7 @@ from hsnoise.fitting.doubts._taps import gains_differ, outputs
 from hsnoise.fitting.flat_notes import gain_notes, scattered
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
-from hsnoise.fitting.result import FitResult, Method
+from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
 from hsnoise.statistics.pixels.along_rows import of_the_signal
@@ -49,16 +49,17 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
-    moved, excess = tuple(moved_frames(found)), -2 * of_the_signal(found.along)
+    moved, shared = tuple(moved_frames(found)), of_the_signal(found.along)
     grave += moved if result.transfer is None else ()
     grave += () if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
-    of_signal = tuple(_coupled(excess))
-    grave += of_signal if abs(excess) > MOST_COUPLED else ()
+    of_signal = tuple(_coupled(shared))
+    grave += of_signal if abs(2 * sum(shared)) > MOST_COUPLED else ()
     share = _outlier_share(result)
     alone = tuple(_by_shape_alone(result))
     grave += alone if is_extraordinary(result) else ()
     minor = (
         *alone,
+        *_fallen_back(result),
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found, _has_noisy_pixels(result)),
@@ -154,16 +155,18 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
         yield from _flats_against_darks(pixel)
 
 
-def _coupled(excess: float) -> Iterator[str]:
+def _coupled(shared: tuple[float, float]) -> Iterator[str]:
     """Shot noise that neighbours share: a pixel's variance is then no measure of its electrons.
 
-    excess: by how much the gain comes out too large, relative.
+    shared: correlation along rows and down columns. What two share is missing in the variance of both.
     """
-    if abs(excess) > COUPLED:
+    (along, down), less = shared, 2 * sum(shared)
+    if abs(less) > COUPLED:
+        above = f", those above each other {down:+.1%}," if down else ""
         yield (
-            f"Neighbours along a row share {-excess / 2:+.1%} of their shot noise: the signal is coupled (hsnoise"
-            f" diagnose may name it), and the gain comes out too {'large' if excess > 0 else 'small'} by up to"
-            f" {abs(excess):.0%}."
+            f"Neighbours along a row share {along:+.1%}{above} of their shot noise: the signal is coupled (hsnoise"
+            f" diagnose may name it), and the gain comes out too {'small' if less > 0 else 'large'} by up to"
+            f" {abs(less):.0%}."
         )
 
 
@@ -257,6 +260,14 @@ def _many_hot(result: FitResult) -> Iterator[str]:
         yield (
             f"{100 * share:.2g} % of the pixels came out as hot: dark currents are not log-normal with a few hot pixels"
             " above. The model's mean over all pixels is right, but its distribution is only rough."
+        )
+
+
+def _fallen_back(result: FitResult) -> Iterator[str]:
+    if result.status == Status.LINE_INSTEAD:
+        yield (
+            f"Maximum likelihood did not converge ({result.detail}): these are the numbers of the line fit, which does"
+            " not separate dark current from read noise at a single exposure, and takes no account of outliers."
         )
 
 

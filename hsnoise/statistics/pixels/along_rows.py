@@ -27,11 +27,15 @@ FREQUENCIES, MEMORIES = np.linspace(0.0, 0.5, 51), np.linspace(0.2, 0.95, 76)
 
 
 class Along(NamedTuple):
-    """Temporal variance of a group's pixels, and their covariance with those NEAR before them [lag], with its error."""
+    """Temporal variance of a group's pixels, and their covariance with those NEAR before them [lag], with its error.
+
+    above_dn2: covariance with the pixel above; NaN where no neighbouring rows were kept.
+    """
 
     variance_dn2: float
     covariance_dn2: np.ndarray
     error_dn2: float
+    above_dn2: float = float("nan")
 
 
 class Ringing(NamedTuple):
@@ -42,10 +46,11 @@ class Ringing(NamedTuple):
     memory: tuple[float, float]
 
 
-def along_rows(counts: np.ndarray, colours: int) -> Along | None:
+def along_rows(counts: np.ndarray, colours: int, rows: np.ndarray | None = None) -> Along | None:
     """Of frames [frame, row, column] of one exposure, `colours` taking turns in a row; None if they do not show it.
 
-    From the change between two frames, without outliers and what rows or columns share.
+    From the change between two frames, without outliers and what rows or columns share. rows: their numbers on the
+    sensor; None if they follow each other.
     """
     pairs, columns = min(len(counts) // 2, MOST_PAIRS), counts.shape[2]
     if not pairs or columns <= 4 * FAR[-1]:
@@ -58,7 +63,20 @@ def along_rows(counts: np.ndarray, colours: int) -> Along | None:
     near, far = (np.array([np.mean([_product(x, lag) for x in several]) for lag in lags]) / 2 for lags in (NEAR, FAR))
     common = np.array([far[FAR % 2 == lag % 2].mean() for lag in NEAR])  # even and odd columns may differ in it
     size = sum(x.size for x in several)
-    return Along(variance, near - common, float(variance * np.sqrt((1 + 2 / len(FAR)) / size)))
+    error = float(variance * np.sqrt((1 + 2 / len(FAR)) / size))
+    numbers = np.arange(counts.shape[1]) if rows is None else rows
+    return Along(variance, near - common, error, _above(several, numbers[: frames.shape[1]]))
+
+
+def _above(changes: list[np.ndarray], rows: np.ndarray) -> float:
+    """Covariance of pixels with those above them, less that of pixels some rows apart, DN^2."""
+    next_row = np.flatnonzero(np.diff(rows) == 1)
+    if not len(next_row):
+        return float("nan")
+    near = np.mean([np.mean(x[next_row + 1] * x[next_row], dtype=np.float64) for x in changes])
+    apart = [lag for lag in FAR if lag < len(rows)]
+    common = [np.mean(x[lag:] * x[:-lag], dtype=np.float64) for x in changes for lag in apart]
+    return float(near - (np.mean(common) if common else 0.0)) / 2
 
 
 def _bounded(change: np.ndarray, colours: int) -> np.ndarray:
@@ -98,17 +116,24 @@ def of_read_noise(groups: Sequence[Along], read_dn2: float, *, unlit: bool = Fal
     return None if of_signal else _ringing(quiet.covariance_dn2 / read_dn2, quiet.error_dn2 / read_dn2)
 
 
-def of_the_signal(groups: Sequence[Along]) -> float:
-    """Correlation of neighbours that their shot noise has, too, so that the signal is coupled; 0 if it is not."""
+def of_the_signal(groups: Sequence[Along]) -> tuple[float, float]:
+    """Correlation along rows, and down columns, that shot noise of neighbours has, so that the signal is coupled.
+
+    0 where it is not, or is not known.
+    """
     if not _by_noise(groups)[1]:
-        return 0.0
+        return 0.0, 0.0
     variance, error = (np.array([one[i] for one in groups]) for i in (0, 2))
-    shared = np.array([one.covariance_dn2[0] for one in groups])
     # What the read noise adds stays as it is: the slope is that of the shot noise.
     design = np.stack([np.ones(len(groups)), variance], 1) / error[:, None]
     covariance = np.linalg.inv(design.T @ design)
-    value = float((covariance @ design.T @ (shared / error))[1])
-    return value if value**2 > SIGNIFICANT**2 * covariance[1, 1] else 0.0
+    shared = np.array([[one.covariance_dn2[0], one.above_dn2] for one in groups]) / error[:, None]
+    both = covariance @ design.T @ shared
+    # Bands of random phases scatter more than pixels.
+    apart = ((shared - design @ both) ** 2).sum(0) / max(len(groups) - 2, 1)
+    chance = SIGNIFICANT * np.sqrt(covariance[1, 1] * np.maximum(np.nan_to_num(apart), 1.0))
+    along, down = np.where(np.abs(both[1]) > chance, np.nan_to_num(both[1]), 0.0)
+    return float(along), float(down)
 
 
 def _by_noise(groups: Sequence[Along]) -> tuple[Along | None, list[Along]]:

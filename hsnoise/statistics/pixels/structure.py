@@ -68,6 +68,13 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
     return block.reshape(2, -1) / np.float32(2)
 
 
+def of_blocks(level: np.ndarray, rows: float) -> np.ndarray:
+    """Means of pixels [pixel], of so many rows, over the blocks of `double_differences` [block]."""
+    maps = level.reshape(int(rows), -1)
+    height, width = (size // 2 * 2 for size in maps.shape)
+    return maps[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3)).ravel()
+
+
 def beside_neighbours(level: np.ndarray, rows: float) -> np.ndarray:
     """Pixels [half, pixel] less their column's median and the mean of a piece of their row, with a pixel's variance.
 
@@ -183,6 +190,16 @@ def has_patterns(found: Survey) -> bool:
         for name in ("row", "column", "row_x_frame", "column_x_frame", "frame"):
             one = plane.components[name]
             if one.variance_dn2 > max(SIGNIFICANT * one.chance_dn2, SMALL_PATTERN * noise):
+                return True
+    return False
+
+
+def responses_differ(found: Survey) -> bool:
+    """Whether the response of pixels to light differs beyond chance, or flats have rows that no row gain makes."""
+    for group in found.groups:
+        for c in range(len(found.channels)) if group.kind == "flat" else ():
+            one = static_of(found, group, c)
+            if one is not None and one.variance_dn2 > max(SIGNIFICANT * one.error_dn2, SMALL_SHARE * one.temporal_dn2):
                 return True
     return False
 

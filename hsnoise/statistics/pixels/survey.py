@@ -222,7 +222,11 @@ def _group(
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
     groups = row_groups_of(np.stack(means), first_row, planes[0].banding.get("row")) if means else None
-    of_frames = along_rows(kept, step), groups, tuple(Path(name).name for name in getattr(stack.counts[i], "names", ()))
+    of_frames = (
+        along_rows(kept, step, rows),
+        groups,
+        tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
+    )
     return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest
 
 
