@@ -53,7 +53,7 @@ def test_imports_only_go_down(path):
 @pytest.mark.parametrize("path", [p for p in FILES if p.parent.name == "effects" and p.name != "__init__.py"])
 def test_effects_never_see_each_other(path):
     within = {module for module in imports(path) if top(module) == "effects"}
-    assert within <= {f"hsnoise.effects.{name}" for name in ("_base", "_facts", "_parameters")}
+    assert within <= {f"hsnoise.effects.{name}" for name in ("_base", "_facts", "_parameters", "_taps")}
 
 
 def test_model_knows_no_single_effect():

@@ -17,9 +17,9 @@ def blocks(values):
     return values[row[:, None], column]
 
 
-def camera(gains, offsets, rng, *, light=(), exposures=(0.0,), cfa="mono", more=0.0):
+def camera(gains, offsets, rng, *, light=(), exposures=(0.0,), cfa="mono", more=0.0, gain=None):
     """Darks of some exposures and flats of a sensor with 8 e- of read noise and pixels that differ."""
-    gain, offset = blocks(gains), blocks(offsets) + rng.normal(0, 0.5, SHAPE) + more
+    gain, offset = blocks(gains) if gain is None else gain, blocks(offsets) + rng.normal(0, 0.5, SHAPE) + more
     dark, response = rng.lognormal(0, 0.5, SHAPE), 1 + 0.01 * rng.standard_normal(SHAPE)
 
     def frames(signal, n):
@@ -86,3 +86,15 @@ def test_a_part_of_the_sensor_has_no_halves(window, rng):
     part = whole.select(rows=(0, 100), columns=(40, 192) if window is None else (40, 216))
     stack = part if window is None else part.with_counts(part.counts, window)
     assert hsnoise.fit(stack, pixels="differ").transfer.taps is None
+
+
+@pytest.mark.parametrize("known", [{"light": (2000, 8000)}, {"exposures": (0.0, 30.0, 300.0)}], ids=["flats", "darks"])
+def test_even_and_odd_columns_of_two_converters(known, rng):
+    """Their gains are 8 % below and above the mean; the noise differs, too."""
+    odd = np.broadcast_to(np.arange(SHAPE[1]) % 2, SHAPE)
+    fit = hsnoise.fit(camera([[0.8]], [[0.0]], rng, gain=np.where(odd, 0.864, 0.736), more=1.5 * odd, **known))
+    value, error, _ = fit.table["odd_even_pattern.gain_mismatch"]
+    assert abs(value - 0.16) < 4 * error < 0.1
+    assert abs(fit.params["odd_even_pattern"].offset - 1.5 / 0.8) < 0.3
+    assert "column_fixed_pattern" not in fit.added
+    assert any("Even and odd columns are read by outputs of their own" in doubt for doubt in fit.doubts)

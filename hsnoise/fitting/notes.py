@@ -43,7 +43,11 @@ def _settings_note(result: FitResult) -> list[str]:
     of = [
         f"{name} " + ", ".join(f"{field} {value}" for field, value in settings.items())
         for name in result.added
-        if (settings := {k: v for k, v in result.params[name].settings().items() if v != "" and v is not False})
+        if (
+            settings := {
+                k: v for k, v in result.params[name].settings().items() if v != "" and v is not False and v is not None
+            }
+        )
     ]
     return [f"Besides the numbers of the table: {'; '.join(of)} (docs/effects.md)."] if of else []
 

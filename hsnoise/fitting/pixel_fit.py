@@ -14,7 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN, joint_estimate
+from hsnoise.fitting.pixel_classes import classes_less
+from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
@@ -22,10 +23,10 @@ from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
-from hsnoise.statistics.pixels.classes import Levels, classes_of, levels_of
+from hsnoise.statistics.pixels.classes import Levels, levels_of
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
@@ -41,12 +42,13 @@ from hsnoise.statistics.pixels.structure import (
     of_blocks,
     plane_rows,
 )
-from hsnoise.statistics.pixels.survey import Plane, Survey
+from hsnoise.statistics.pixels.survey import Group, Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
+HIT = 2.0  # ratio of the mean temporal variance to that without outliers: hits make most of it
 RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
@@ -108,7 +110,7 @@ class PixelFit:
 
     ringing: the part of the read noise that goes on along rows, if it is there.
     row_groups: rows that are read together, if there are.
-    taps: blocks of the frame that separate outputs read; None for one output.
+    taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -117,6 +119,7 @@ class PixelFit:
     ringing: Ringing | None
     row_groups: RowGroups | None
     taps: Taps | None
+    code_step: int
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -139,7 +142,17 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    return PixelFit(tuple(channels), flats, ringing, found.row_groups, taps, estimate, covariance, bool(known.all()))
+    return PixelFit(
+        tuple(channels),
+        flats,
+        ringing,
+        found.row_groups,
+        taps,
+        found.code_step,
+        estimate,
+        covariance,
+        bool(known.all()),
+    )
 
 
 def _channel(found: Survey, c: int, name: str) -> Channel:
@@ -154,7 +167,9 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     banding = banding_in(found, c)
     row_gain = partial(_row_gain, found, c, spectrum, banding)
-    transfer = None if pixels is None else _transfer(pixels, found, row_gain(growth))
+    rays, transfer = _rays(found, c) if narrow is None else None, None
+    if pixels is not None:
+        transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
     values, population = np.array([1.0, floor, growth]), None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if tail is not None:
@@ -171,6 +186,9 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
             # If ordinary pixels do not grow, hot ones only give a bound.
             values[:2], covariance = without, np.diag([UNKNOWN**2, of_without, covariance[2, 2]])
+    if found.code_step > 1:
+        coarse = ROUNDING * (found.code_step**2 - 1)
+        values[1], floor = max(values[1] - coarse, ROUNDING), max(floor - coarse, ROUNDING)
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
@@ -198,7 +216,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if narrow is None else UNKNOWN_SPREAD,
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
-        rays=_rays(found, c) if narrow is None else None,
+        rays=rays,
         jumps=jumps,
         banding=banding,
         subtracted=subtracted(transfer, (growth, growth_error)),
@@ -250,17 +268,6 @@ def _warm(found: Survey, c: int) -> Warm | None:
     if found.shortest is None:
         return None
     return warm_of(found.shortest.pixels(c, "level_dn"), len(shortest_of(found, c)[0].column_mean_dn))
-
-
-def _transfer(pixels: Levels, found: Survey, row_gain: tuple[float, float]) -> Transfer | None:
-    """Pixel transfer, after subtracting the variance that row gain adds to pixels brighter than their row."""
-    classes = classes_of(pixels, found.full_scale_dn)
-    variance, error = row_gain
-    if variance > ROW_GAIN_THERE * error:
-        ordinary = np.median(classes.level_dn[~classes.hot], axis=0) if (~classes.hot).any() else 0.0
-        streaks = variance * (classes.level_dn - ordinary) ** 2
-        classes = replace(classes, variance_dn2=np.maximum(classes.variance_dn2 - streaks, 1e-3))
-    return pixel_transfer(classes)
 
 
 def _offset(found: Survey, c: int) -> tuple[float, float]:
@@ -354,7 +361,7 @@ def _row_gain(
     """
     groups = found.repeated_darks
     signal = growth * np.array([g.exposure_s for g in groups])
-    parts = [mean_of([p.components["row_x_frame"] for p in g.of(c)]) for g in groups]
+    parts = [_rows_over_frames(group, c) for group in groups]
     y = np.array([one.variance_dn2 for one in parts])
     error = spectrum.widened * np.array([one.standard_error_dn2 for one in parts]) + 1e-12
     of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
@@ -367,6 +374,17 @@ def _row_gain(
     theta = covariance @ design.T @ (y / error)
     error_of_gain = float(np.sqrt(covariance[1, 1])) / unit**2
     return (float(theta[1]) / unit**2, error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
+
+
+def _rows_over_frames(group: Group, c: int) -> Component:
+    """Variance of rows over frames; where hits make most of the noise, without them: tracks lie in few rows."""
+    planes = group.of(c)
+    found = mean_of([p.components["row_x_frame"] for p in planes])
+    noise_dn2 = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)[0]
+    if np.mean([p.components["temporal"].variance_dn2 for p in planes]) < HIT * noise_dn2:
+        return found
+    cut = float(np.mean([p.halves.rows_dn2 for p in planes]))
+    return replace(found, variance_dn2=min(found.variance_dn2, cut))
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:

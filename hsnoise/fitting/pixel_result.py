@@ -21,6 +21,8 @@ from hsnoise.effects import (
     DarkSignalNonuniformity,
     FrameOffset,
     HotPixels,
+    MissingCodes,
+    OddEvenPattern,
     PeriodicBanding,
     PhotoResponseNonuniformity,
     RandomTelegraphNoise,
@@ -65,12 +67,14 @@ OF_PIXELS = (
     ColumnNoise,
     TapOffsets,
     TapGains,
+    OddEvenPattern,
     BlackShading,
     CorrelatedReadNoise,
     CosmicRays,
     RandomTelegraphNoise,
     PeriodicBanding,
     BlackClamp,
+    MissingCodes,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -152,6 +156,7 @@ def _population(
         _, one = drift
         found["black_shading"] = {"amplitude": (one.amplitude_dn, one.error_dn), "length": (one.length, 0.0)}
     found |= {name: {"sigma": of.sigma} for name, of in shared.items()}
+    found |= {"missing_codes": {"gain": (float(pixel.code_step), np.inf)}} if pixel.code_step > 1 else {}
     found |= {} if pixel.taps is None else of_taps(pixel.taps, float(gain.mean()))
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
@@ -335,7 +340,8 @@ def _model(
         if name in classes:
             specs, measured = classes[name].specs(), population.get(name, {})
             fields = {
-                of: value if specs[of].low is None else np.maximum(value, 0.0) for of, (value, _) in measured.items()
+                of: value if (low := specs[of].low) is None else np.maximum(value, low)
+                for of, (value, _) in measured.items()
             }
             required = [f.name for f in dataclasses.fields(classes[name]) if f.default is dataclasses.MISSING]
             fields = fields or {field: classes[name].specs()[field].low or 0.0 for field in required}

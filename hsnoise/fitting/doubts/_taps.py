@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise.fitting.pixel_shared import GAINS_THERE
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.taps import Taps
 
@@ -15,13 +16,15 @@ DIFFER = 0.02  # largest relative difference of gains that is no doubt
 def gains_differ(result: FitResult) -> Iterator[str]:
     """That no pixel may have the gain of the table."""
     taps = _taps(result)
-    if taps is not None and "tap_gains" in result.added and np.ptp(taps.gain) > DIFFER:
-        rows, columns = (n // of for n, of in zip(result.summary.shape, (taps.rows, taps.columns), strict=True))
-        yield (
-            f"{_outputs(taps)}, and their gains differ: {_listed(taps.gain, '.3f')} of the mean"
-            f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are means;"
-            f" --roi 0:{rows},0:{columns}, or stack.select, fits the first output alone."
-        )
+    if taps is None or not _sure(taps) or np.ptp(taps.gain) < DIFFER:
+        return
+    rows, columns = (n // of for n, of in zip(result.summary.shape, (taps.rows, taps.columns), strict=True))
+    alone = "counts[..., ::2]" if taps.interleaved else f"--roi 0:{rows},0:{columns}, or stack.select,"
+    yield (
+        f"{_outputs(taps)}, and their gains differ: {_listed(taps.gain, '.3f')} of the mean"
+        f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are means;"
+        f" {alone} fits the first output alone."
+    )
 
 
 def outputs(result: FitResult) -> Iterator[str]:
@@ -38,7 +41,14 @@ def _taps(result: FitResult) -> Taps | None:
     return None if result.transfer is None else result.transfer.taps
 
 
+def _sure(taps: Taps) -> bool:
+    spread, error = taps.gain_spread
+    return spread > GAINS_THERE * error
+
+
 def _outputs(taps: Taps) -> str:
+    if taps.interleaved:
+        return "Even and odd columns are read by outputs of their own"
     return f"{taps.rows} x {taps.columns} outputs read blocks of the frame (rows x columns)"
 
 

@@ -60,6 +60,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     minor = (
         *alone,
         *_fallen_back(result),
+        *_coarse_codes(result, found),
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found, _has_noisy_pixels(result)),
@@ -80,6 +81,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
             *pixel_notes(result),
             *defects(result),
             *outputs(result),
+            *_of_codes(found),
             *_of_neighbours(result),
             *_of_narrow(result, found),
             *_of_flats(result),
@@ -269,6 +271,20 @@ def _fallen_back(result: FitResult) -> Iterator[str]:
             f"Maximum likelihood did not converge ({result.detail}): these are the numbers of the line fit, which does"
             " not separate dark current from read noise at a single exposure, and takes no account of outliers."
         )
+
+
+def _coarse_codes(result: FitResult, found: Survey) -> Iterator[str]:
+    if result.transfer is None and found.code_step > 1 and "missing_codes" not in result.params:
+        yield (
+            f"All counts are multiples of {found.code_step} DN, and this fit takes their rounding for read noise:"
+            f" {found.code_step / np.sqrt(12):.2g} DN rms. Divide counts and levels by {found.code_step}, if its codes"
+            " are that far apart because they were shifted."
+        )
+
+
+def _of_codes(found: Survey) -> Iterator[str]:
+    if found.code_step > 1:
+        yield f"All counts are multiples of {found.code_step} DN; the noise of their rounding is not in the read noise."
 
 
 def _has_noisy_pixels(result: FitResult) -> bool:

@@ -113,7 +113,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     limit = hot_from(growth)
     if pixels.n_frames.min() >= FEWEST_FRAMES:
         measuring = [half for half in (0, 1) if pixels.n_frames.min() >= 3 + half]  # two frames at least
-        both = [_Half(pixels.level[:, h], pixels.variance[:, h], pixels.peak[:, h]) for h in (0, 1)]
+        both = [_half(pixels, of) for of in (0, 1)]
         parts = [
             _measured(
                 _members(growth[1 - half], _edges(growth[1 - half], limit, True)),
@@ -140,6 +140,20 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
     hot = np.concatenate([[g[m].mean() > limit for m in p[-1]] for g, p in zip(grown, parts, strict=True)])
     share = apart.sum(0) / max(count.sum(), 1)
     return Classes(t, level, variance, error, count, hot.astype(bool), limit, pixels.pedestal_sigma_dn, share)
+
+
+def _half(pixels: Levels, half: int) -> _Half:
+    frames = (pixels.n_frames + 1 - half) // 2
+    own = np.sqrt(1 - 1 / np.maximum(frames, 2))[:, None]
+    return _Half(pixels.level[:, half], pixels.variance[:, half], pixels.peak[:, half] / own)
+
+
+def least_hit(sigma_dn: np.ndarray, n_frames: np.ndarray) -> np.ndarray:
+    """Charge of single frames from which a pixel is left out [class, exposure], DN; less counts as its noise.
+
+    sigma_dn [class, exposure]: of its class. n_frames [exposure]: of which half measure.
+    """
+    return OUTLIER_SIGMAS * sigma_dn / np.sqrt(1 - 1 / np.maximum(n_frames / 2, 2))
 
 
 def slope_over(exposure_s: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -222,7 +236,10 @@ def _members(growth: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
 
 
 class _Half(NamedTuple):
-    """Every pixel in half of the frames, [exposure, pixel]; see `Halves`."""
+    """Every pixel in half of the frames, [exposure, pixel]; see `Halves`.
+
+    peak: largest deviation from the mean, in units of the deviation that it has of the mean of so few frames.
+    """
 
     level: np.ndarray
     variance: np.ndarray

@@ -45,6 +45,7 @@ class Halves:
         frame_means_dn [frame]: level of each frame relative to the typical one, DN.
         pair_variance_dn2 [pixel]: temporal variance over all frames, DN^2.
         third_dn3, fourth_dn4 [pixel]: third and fourth central moments over all frames, DN^3, DN^4.
+        rows_dn2: variance of rows over frames beside that of their pixels, outliers cut, DN^2.
         frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
         hits: pixels far above their level in one frame; None of too few frames.
     """
@@ -59,6 +60,7 @@ class Halves:
     pair_variance_dn2: np.ndarray
     third_dn3: np.ndarray
     fourth_dn4: np.ndarray
+    rows_dn2: float
     frame_noise_dn: np.ndarray
     hits: Hits | None
 
@@ -99,9 +101,8 @@ def halves_of(counts: np.ndarray) -> Halves:
     third, fourth = _higher(flat)
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
     frames = len(flat[::2]), len(flat[1::2])
-    return Halves(
-        frames, level, variance, peak, lowest, highest, frame_means, whole, third, fourth, noise, hits_of(flat)
-    )
+    moments, rows_dn2 = (whole, third, fourth), n * of_lines[0]
+    return Halves(frames, level, variance, peak, lowest, highest, frame_means, *moments, rows_dn2, noise, hits_of(flat))
 
 
 def _higher(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sam
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
+MOST_CODES = 100_000  # counts of a frame that tell the step of its codes
 NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN^2
 
 
@@ -114,7 +115,8 @@ class Group:
 class Survey:
     """The result of one pass over a stack: its groups, the rows [row] of the sampled pixels, and the shape.
 
-    is_whole: whether the frames are not known to be a part of a sensor's.
+    is_whole: whether the frames are not known to be a part of a sensor's. code_step: the largest number of which all
+    counts are multiples, DN: 16 of 12 bits that are shifted into 16.
     """
 
     groups: tuple[Group, ...]
@@ -124,6 +126,7 @@ class Survey:
     shape: tuple[int, int]
     full_scale_dn: float
     is_whole: bool
+    code_step: int
 
     def stuck(self, channel: int) -> np.ndarray:
         """Sampled pixels of a channel [pixel] with the same count in all frames of the noisy groups."""
@@ -173,14 +176,16 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
     cell = len(cfa_tile(stack.cfa))
     rows = sampled_rows(stack.shape, cell, stack.n_exposures, max(stack.n_frames))
     highest = 0
-    groups, shortest = [], shortest_repeated(stack)
+    groups, steps, shortest = [], [], shortest_repeated(stack)
     for i in range(stack.n_exposures):
-        group, top = _group(stack, i, rows, tick, looks_for_row_groups=i == shortest)
+        group, top, step = _group(stack, i, rows, tick, looks_for_row_groups=i == shortest)
         groups.append(group)
+        steps.append(step)
         highest = max(highest, top)
     full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
     is_whole = stack.window is None or tuple(stack.window[2:]) == stack.shape
-    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full, is_whole)
+    step = int(np.gcd.reduce(steps))
+    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full, is_whole, step)
 
 
 def _full_scale(highest: int) -> float:
@@ -192,7 +197,8 @@ def _full_scale(highest: int) -> float:
 
 def _group(
     stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object], *, looks_for_row_groups: bool
-) -> tuple[Group, int]:
+) -> tuple[Group, int, int]:
+    """A group, its highest count, and the largest number of which the counts of its first frame are multiples."""
     tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
     step, channels = len(tile), len(stack.channels)
     sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
@@ -227,7 +233,8 @@ def _group(
         groups,
         tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
     )
-    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest
+    of_codes = int(np.gcd.reduce(kept[0].ravel()[:: max(1, kept[0].size // MOST_CODES)].astype(np.int64)))
+    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest, of_codes
 
 
 def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plane:

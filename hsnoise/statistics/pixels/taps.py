@@ -1,4 +1,4 @@
-"""Blocks of the frame that separate outputs read: sharp steps of level or noise at halves, quarters, eighths."""
+"""Outputs that read blocks of the frame (level or noise step at halves, quarters, eighths), or every second column."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ SEAM = 8.0  # typical differences between neighbouring runs of lines
 REACH, LEAST_REACH = 16, 4  # lines on each side of a seam
 FEWEST_PLACES = 24  # elsewhere, which tell the typical difference
 MOST = 0.6  # share of the new seams of a layout that must be there
+LEAST = 1e-4  # of the noise's variance: a difference of even and odd columns that changes no frame visibly
+PIECES = 8  # of a row, in all of which even columns lie on one side of odd ones
 FILLED = 0.7  # of full scale: above it the response may bend
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
 
-Bounds = list[tuple[int, int]]
+Bounds = list[slice]
 
 
 class Taps(NamedTuple):
-    """Outputs that read blocks of the frame.
+    """Outputs that read blocks of the frame or, `interleaved`, even and odd columns of each colour.
 
     Attributes:
-        rows, columns: number of blocks over the rows and over the columns.
+        rows, columns: number of blocks over the rows and over the columns; 1 and 2 of interleaved ones.
         offset_dn [block row, block column]: level without signal less its mean, DN.
         noise_dn: temporal noise of the typical pixel without signal, DN.
         gain, gain_error: relative to the mean of the outputs, by the variance that signal adds; NaN without signal.
@@ -38,11 +40,13 @@ class Taps(NamedTuple):
     noise_dn: np.ndarray
     gain: np.ndarray
     gain_error: np.ndarray
+    interleaved: bool
 
     def of_lines_dn(self, axis: str, lines: int) -> np.ndarray:
         """Mean offset of each of the rows or columns of a plane [line], DN."""
         blocks = self.offset_dn.mean(1 if axis == "row" else 0)
-        return blocks[np.arange(lines) * len(blocks) // lines]
+        numbers = np.arange(lines)
+        return blocks[numbers % len(blocks) if self.interleaved else numbers * len(blocks) // lines]
 
     @property
     def gain_spread(self) -> tuple[float, float]:
@@ -61,12 +65,17 @@ def taps_of(found: Survey) -> Taps | None:
         return None
     level, noise = _map(group, "level_dn"), np.log(np.maximum(_map(group, "pair_variance_dn2"), 1e-6))
     rows, columns = (max(_layout(of, axis, found) for of in (level, noise)) for axis in (0, 1))
-    if rows * columns == 1:
+    interleaved = rows * columns == 1 and any(_alternates(of) for of in (level, noise))
+    if rows * columns == 1 and not interleaved:
         return None
     bounds = [_bounds(found, axis, count) for axis, count in enumerate((rows, columns))]
+    if interleaved:
+        columns, bounds[1] = 2, [slice(0, None, 2), slice(1, None, 2)]
     offset, variance, _ = _moments(group, bounds)
     offset -= offset.mean()
-    return Taps(rows, columns, offset, np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds))
+    if interleaved and not _alternates(noise) and offset.var() < LEAST * variance.mean():
+        return None
+    return Taps(rows, columns, offset, np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds), interleaved)
 
 
 def levelled(found: Survey, taps: Taps) -> Survey:
@@ -103,7 +112,16 @@ def _bounds(found: Survey, axis: int, count: int) -> Bounds:
     step = 1 if found.cfa == "mono" else 2
     lines = found.sampled_rows[::step] if axis == 0 else np.arange(0, found.shape[1], step)
     edges = np.searchsorted(lines, [of * found.shape[axis] / count for of in range(count + 1)])
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    return [slice(start, stop) for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+
+
+def _alternates(values: np.ndarray) -> bool:
+    """Whether even and odd columns differ by more than columns of one kind do, everywhere alike."""
+    profile = np.median(values, axis=0)
+    beside = (profile[1:-1] - (profile[:-2] + profile[2:]) / 2) * (-1.0) ** np.arange(len(profile) - 2)
+    pieces = np.array([np.median(of) for of in np.array_split(beside, PIECES)])
+    error = 1.4826 * float(np.median(np.abs(beside - np.median(beside)))) / np.sqrt(len(beside))
+    return bool(abs(np.median(beside)) > SEAM * error and (np.sign(pieces) == np.sign(pieces[0])).all())
 
 
 def _layout(values: np.ndarray, axis: int, found: Survey) -> int:
@@ -114,7 +132,7 @@ def _layout(values: np.ndarray, axis: int, found: Survey) -> int:
     profiles = [np.median(of, axis=1 - axis) for of in parts]
     most = 1
     for count in LAYOUTS[axis]:
-        edges = [start for start, _ in _bounds(found, axis, count)[1:]]
+        edges = [of.start for of in _bounds(found, axis, count)[1:]]
         new = edges[::2] if count > 2 else edges  # the others are those of half as many outputs
         there = [any(_is_seam(profile, edge, edges) for profile in profiles) for edge in new]
         if np.mean(there) >= MOST:
@@ -166,9 +184,9 @@ def _moments(group: Group, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray
     """Level of the typical pixel, mean variance without outliers, and its error, of each block."""
     variance = _map(group, "pair_variance_dn2")
     both = [
-        [without_outliers(variance[r0:r1, c0:c1].ravel(), group.n_frames) for c0, c1 in bounds[1]]
-        for r0, r1 in bounds[0]
+        [without_outliers(variance[rows, columns].ravel(), group.n_frames) for columns in bounds[1]]
+        for rows in bounds[0]
     ]
     level = _map(group, "level_dn")
-    typical = [[float(np.median(level[r0:r1, c0:c1])) for c0, c1 in bounds[1]] for r0, r1 in bounds[0]]
+    typical = [[float(np.median(level[rows, columns])) for columns in bounds[1]] for rows in bounds[0]]
     return np.array(typical), *np.moveaxis(np.array(both), 2, 0)
