@@ -14,7 +14,7 @@ from hsnoise.effects._parameters import param
 
 
 class AmplifierGlow(AbstractEffect):
-    """Extra electrons, Poisson(rate * exposure * exp(-d / scale)), at distance d from the glowing spot.
+    """Extra electrons, Poisson(rate * exposure * exp(-(d / scale)^power)), at distance d from the glowing spot.
 
     Transistors in saturation emit infrared light that the neighbouring pixels see. Distances are in units of the
     frame's diagonal, those along the rows divided by `aspect`; the spot lies anywhere in the frame, by default in the
@@ -42,6 +42,9 @@ class AmplifierGlow(AbstractEffect):
         "1", low=0, high=1, default=1.0, held="at bounds", doc="column of the brightest spot: 0 the first, 1 the last"
     )
     aspect: Scalar = param("1", low=0.1, high=10, default=1.0, doc="width of the glow over its height")
+    power: Scalar = param(
+        "1", low=0.3, high=4, default=1.0, held=True, doc="how it fades: 1 exponentially, 2 as a normal curve; held"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         last_row, last_column = (n - 1 for n in capture.sensor_shape)
@@ -50,7 +53,7 @@ class AmplifierGlow(AbstractEffect):
         squared = (down[:, None] ** 2 + right[None] ** 2) / max(last_row**2 + last_column**2, 1)
         # The small term keeps the derivative finite in the spot itself.
         distance = jnp.sqrt(squared + 1e-12)
-        mean = self.rate * capture.exposure_s * jnp.exp(-distance / self.scale)
+        mean = self.rate * capture.exposure_s * jnp.exp(-((distance / self.scale) ** self.power))
         return signal + draw_poisson(key, mean[None], signal.shape)
 
     @classmethod

@@ -19,14 +19,14 @@ from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
-from hsnoise.fitting.pixel_rows import RowSpectrum, row_spectrum
+from hsnoise.fitting.pixel_rows import RowSpectrum, row_gain_of_darks, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
-from hsnoise.statistics.pixels.classes import Levels, levels_of
+from hsnoise.statistics.pixels.classes import Levels, hot_from, kept_of, levels_of, slope_over
+from hsnoise.statistics.pixels.glow import Glow, glow_of, glow_of_pixels, without_glow
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
@@ -42,13 +42,12 @@ from hsnoise.statistics.pixels.structure import (
     of_blocks,
     plane_rows,
 )
-from hsnoise.statistics.pixels.survey import Group, Plane, Survey
+from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
 
 DETERMINED = 0.25  # relative standard error up to which a gain counts as determined
 MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps that look like signal
-HIT = 2.0  # ratio of the mean temporal variance to that without outliers: hits make most of it
 RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
@@ -80,6 +79,7 @@ class Channel:
             is not in `patterns`.
         subtracted: dark signal that the camera subtracts, DN/s, and its error; infinite if there is none.
         jumps: pixels that jump between levels; None if there are none.
+        glow: what fades from one spot; None if nothing does. It is in none of the dark currents.
     """
 
     name: str
@@ -100,6 +100,7 @@ class Channel:
     warm: Warm | None
     rays: Rays | None
     jumps: Jumps | None
+    glow: Glow | None
     banding: tuple[str, Banding] | None
     subtracted: tuple[float, float]
 
@@ -166,11 +167,11 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     pixels = levels_of(found, c, without=jumping) if narrow is None else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     banding = banding_in(found, c)
-    row_gain = partial(_row_gain, found, c, spectrum, banding)
+    row_gain = partial(row_gain_of_darks, found, c, spectrum, banding)
     rays, transfer = _rays(found, c) if narrow is None else None, None
     if pixels is not None:
         transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
-    values, population = np.array([1.0, floor, growth]), None
+    values, population, glow = np.array([1.0, floor, growth]), None, None
     covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if tail is not None:
         _raise(values, covariance, tail)
@@ -181,7 +182,9 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
             _correct(values, covariance, jumps, raised)
         if tail is not None:
             _raise(values, covariance, tail)
-        population = _population(found, c, pixels, transfer)
+        glow = glow_of(found, c)
+        of_glow = None if glow is None else glow_of_pixels(glow, found, c)[kept_of(found, c, jumping)]
+        population = _population(found, c, pixels, transfer, of_glow)
         values[2] = population.mean
         if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
             # If ordinary pixels do not grow, hot ones only give a bound.
@@ -218,6 +221,7 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         warm=warm,
         rays=rays,
         jumps=jumps,
+        glow=glow,
         banding=banding,
         subtracted=subtracted(transfer, (growth, growth_error)),
     )
@@ -345,46 +349,15 @@ def _temporal(found: Survey, c: int, raised: float) -> tuple[float, float]:
     return mean / raised, error
 
 
-def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer) -> Population:
-    t = pixels.exposure_s
-    slopes = (t - t.mean()) / ((t - t.mean()) @ (t - t.mean()))
-    shift = float(slopes @ transfer.pedestal_dn)
-    return population_of(pixels, transfer.classes.limit_dn_per_s, float(transfer.values[2]), shift, *_pattern(found, c))
-
-
-def _row_gain(
-    found: Survey, c: int, spectrum: RowSpectrum, banding: tuple[str, Banding] | None, growth: float
-) -> tuple[float, float]:
-    """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error.
-
-    Rows that resemble each other, bands, and noise of some frames vary more from exposure to exposure.
-    """
-    groups = found.repeated_darks
-    signal = growth * np.array([g.exposure_s for g in groups])
-    parts = [_rows_over_frames(group, c) for group in groups]
-    y = np.array([one.variance_dn2 for one in parts])
-    error = spectrum.widened * np.array([one.standard_error_dn2 for one in parts]) + 1e-12
-    of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
-    error = np.maximum(np.hypot(error, of_band), [g.rows_error_dn2(c) for g in groups])
-    if len(groups) < 2 or np.ptp(signal) <= 0:
-        return 0.0, UNKNOWN
-    unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse
-    design = np.stack([np.ones_like(signal), (signal / unit) ** 2], 1) / error[:, None]
-    covariance = np.linalg.pinv(design.T @ design)
-    theta = covariance @ design.T @ (y / error)
-    error_of_gain = float(np.sqrt(covariance[1, 1])) / unit**2
-    return (float(theta[1]) / unit**2, error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
-
-
-def _rows_over_frames(group: Group, c: int) -> Component:
-    """Variance of rows over frames; where hits make most of the noise, without them: tracks lie in few rows."""
-    planes = group.of(c)
-    found = mean_of([p.components["row_x_frame"] for p in planes])
-    noise_dn2 = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)[0]
-    if np.mean([p.components["temporal"].variance_dn2 for p in planes]) < HIT * noise_dn2:
-        return found
-    cut = float(np.mean([p.halves.rows_dn2 for p in planes]))
-    return replace(found, variance_dn2=min(found.variance_dn2, cut))
+def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer, of_glow: np.ndarray | None) -> Population:
+    """The pixels' dark currents, beside a glow, DN/s [pixel]."""
+    t, limit, ordinary = pixels.exposure_s, transfer.classes.limit_dn_per_s, float(transfer.values[2])
+    shift = float(slope_over(t, transfer.pedestal_dn))
+    if of_glow is not None:
+        ordinary -= float(of_glow[slope_over(t, pixels.level).mean(0) < limit].mean())
+        pixels = without_glow(pixels, of_glow)
+        limit = hot_from(slope_over(t, pixels.level))
+    return population_of(pixels, limit, ordinary, shift, *_pattern(found, c))
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:

@@ -19,7 +19,8 @@ def growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[f
     darks = found.darks
     t = np.array([g.exposure_s for g in darks])
     planes = [g.of(c) for g in darks]
-    level = np.array([np.mean([_level(p) for p in of]) for of in planes])
+    narrow = any(p.narrow_dn is not None for of in planes for p in of)
+    level = np.array([np.mean([_level(p, narrow) for p in of]) for of in planes])
     frames = [
         np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
         for of in planes
@@ -47,9 +48,13 @@ def _line(exposure_s: np.ndarray, level_dn: np.ndarray, error_dn: np.ndarray) ->
     return float(theta[1]), float(np.sqrt(covariance[1, 1]))
 
 
-def _level(plane: Plane) -> float:
-    """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it."""
-    if plane.narrow_dn is not None:  # most pixels have the same count, which is the median
+def _level(plane: Plane, narrow: bool) -> float:
+    """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it.
+
+    narrow: whether noise at some exposure is below a count; most pixels have the same one there, which is the median,
+    so that it is the mean pixel at all exposures.
+    """
+    if narrow:
         return float(plane.row_mean_dn.mean())
     return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise.effects import (
     AbstractEffect,
+    AmplifierGlow,
     BlackClamp,
     BlackShading,
     ColumnFixedPattern,
@@ -34,20 +35,20 @@ from hsnoise.effects import (
     TapGains,
     TapOffsets,
 )
-from hsnoise.fitting.pixel_fit import Channel, PixelFit, weighted_mean
+from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_colours, rays_of, warm_of
+from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
-from hsnoise.fitting.pixel_shared import Shared, of_taps, shared_patterns
+from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
-from hsnoise.statistics.pixels.population import Population
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.transfer import ROUNDING
 
 NOMINAL = 50.0  # relative standard error of an unknown gain
-FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
+
 THERE = 5.0  # standard errors above which a population effect enters the model
 SUBTRACTED = 2.0  # the same of a dark signal that is subtracted, where pedestals or levels have moved beyond chance
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
@@ -74,6 +75,7 @@ OF_PIXELS = (
     RandomTelegraphNoise,
     PeriodicBanding,
     BlackClamp,
+    AmplifierGlow,
     MissingCodes,
 )
 POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
@@ -167,25 +169,25 @@ def _population(
         sigma, error = found["row_noise"]["sigma"]
         found["row_noise"]["sigma"] = sigma, error * max(c.row_spectrum.widened for c in pixel.channels)
         if all(value != 0 for value, _ in exponents):
-            found["row_noise"]["exponent"] = _mean(exponents)
-    offset = _mean([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
+            found["row_noise"]["exponent"] = of_colours(exponents)
+    offset = of_colours([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
-    found |= {**_noise_spread(pixel), **_rays(pixel, gain), **_jumps(pixel, gain)}
+    found |= {**_noise_spread(pixel), **rays_of(pixel, gain), **jumps_of(pixel, gain), **of_glow(pixel.channels, gain)}
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
-    response = _mean([c.photo_response for c in pixel.channels])
+    response = of_colours([c.photo_response for c in pixel.channels])
     if response[0] > max(THERE * response[1], LEAST_RESPONSE):
         found["photo_response_nonuniformity"] = {"sigma": response}
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
-        return found | _warm(pixel, gain, longest_s)
-    spread = _mean(
+        return found | warm_of(pixel, gain, longest_s)
+    spread = of_colours(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
-    return found | _hot(pixel, many)
+    return found | hot_of(pixel, many)
 
 
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
@@ -204,7 +206,7 @@ def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, 
 
 def _noise_spread(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
     """Read noise that differs between pixels, rows or columns: means over the colours."""
-    differs, *others = (_mean(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
+    differs, *others = (of_colours(list(of)) for of in zip(*(c.noise_spread for c in pixel.channels), strict=True))
     lines = {name: of for name, of in zip(("row_spread", "column_spread", "tail"), others, strict=True) if of[0] > 0}
     is_there = lines or differs[0] > max(THERE * differs[1], LEAST_NOISE_SPREAD)
     return {"read_noise_nonuniformity": {"spread": differs, **lines}} if is_there else {}
@@ -219,82 +221,14 @@ def _with_banks(population: dict, pixel: PixelFit, model: NoiseModel | None) -> 
         return population
     of_rows = {"exponent": (0.0, np.inf), **population["row_noise"], "shared": (1.0, np.inf)}
     if there:
-        of_rows["exponent"], of_rows["shared"] = (_mean([of[i] for of in banks if of is not None]) for i in (0, 1))
+        of_rows["exponent"], of_rows["shared"] = (of_colours([of[i] for of in banks if of is not None]) for i in (0, 1))
     return {**{name: of for name, of in population.items() if name != "row_noise"}, "row_bank_noise": of_rows}
-
-
-def _hot(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels, if most colours have more than by chance: means over those colours."""
-    hot = [(p, g) for p, g in many if p.hot_fraction[0] > 0 and p.hot_rate[0] > 0]
-    if 2 * len(hot) <= len(many):
-        return {}
-    found = {
-        "fraction": _mean([p.hot_fraction for p, _ in hot]),
-        "rate": _mean([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in hot]),
-        "at_readout": _mean([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in hot]),
-    }
-    heavy = [p.hot_spread for p, _ in hot if p.hot_spread[0] > 0]
-    if 2 * len(heavy) > len(hot):
-        found["spread"] = _mean(heavy)
-    fano = _fano(pixel)
-    return {"hot_pixels": found if fano is None else found | {"fano": fano}}
-
-
-def _warm(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels from darks of one exposure: charge of the exposure, or of the readout if the exposure is zero."""
-    many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
-    if not many:
-        return {}
-    fraction = _mean([warm.fraction for warm, _ in many])
-    charge = _mean([(warm.extra_dn[0] / g, warm.extra_dn[1] / g) for warm, g in many])
-    tail = _mean([warm.spread for warm, _ in many])
-    hot = {"fraction": fraction} | ({"spread": tail} if tail[0] > 0 else {})
-    if longest_s > 0:
-        return {"hot_pixels": {**hot, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
-    return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}
-
-
-def _rays(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
-    """Cosmic rays, if all colours have hits of single frames: means over the colours."""
-    told = [(c.rays, g) for c, g in zip(pixel.channels, gain, strict=True) if c.rays is not None]
-    if len(told) < len(pixel.channels):
-        return {}
-    charge = _mean([(rays.charge_dn[0] / g, rays.charge_dn[1] / g) for rays, g in told])
-    rate, at_readout = (_mean([of[i] for of, _ in told]) for i in (0, 2))
-    return {"cosmic_rays": {"rate": rate, "charge": charge, "at_readout": at_readout}}
-
-
-def _jumps(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
-    """Pixels that jump, if all colours have them, of one kind: means over the colours."""
-    told = [(c.jumps, g) for c, g in zip(pixel.channels, gain, strict=True) if c.jumps is not None]
-    if len(told) < len(pixel.channels) or len({jumps[3:5] for jumps, _ in told}) > 1:
-        return {}
-    amplitude = _mean([(jumps.amplitude_dn[0] / g, jumps.amplitude_dn[1] / g) for jumps, g in told])
-    fraction, duty = (_mean([getattr(jumps, name) for jumps, _ in told]) for name in ("fraction", "duty"))
-    spread = float(told[0][0].exponential), np.inf
-    return {"random_telegraph_noise": {"fraction": fraction, "amplitude": amplitude, "duty": duty, "spread": spread}}
 
 
 def _shading(pixel: PixelFit) -> tuple[str, Shading] | None:
     """Axis and size of the strongest drift of the black level, of the first colour that has one."""
     many = [(axis, one) for c in pixel.channels[:1] for axis, one in c.shading.items()]
     return max(many, key=lambda pair: pair[1].amplitude_dn) if many else None
-
-
-def _fano(pixel: PixelFit) -> tuple[float, float] | None:
-    """Fano factor of the hot pixels, if significantly below 1; flats give it more precisely than ordinary pixels."""
-    told = []
-    for c, channel in enumerate(pixel.channels):
-        t = channel.transfer
-        if t is None or not np.isfinite(t.hot_gain) or not pixel.determined:
-            continue
-        gain, error = pixel.estimate[c], np.sqrt(pixel.covariance[c, c])
-        ratio = t.hot_gain / gain
-        told.append((ratio, ratio * np.hypot(t.hot_error / t.hot_gain, error / gain)))
-    if not told:
-        return None
-    value, error = weighted_mean(told)
-    return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
 
 
 def _with(pixel: PixelFit, many):
@@ -304,12 +238,6 @@ def _with(pixel: PixelFit, many):
 def _mean_error(channel: Channel) -> float:
     """Relative error of the mean dark current: spread is relative to it."""
     return float(np.sqrt(channel.covariance[2, 2]) / max(abs(channel.values[2]), 1e-12))
-
-
-def _mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values over the colours and its error; infinite errors are those of values of 0."""
-    values, errors = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
-    return float(values.mean()), float(np.sqrt((errors**2).sum()) / len(pairs))
 
 
 def _black(pixel: PixelFit, summary: Summary) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What the rows of a frame share: how one row resembles the next, and the next but one."""
+"""What the rows of a frame share: how one row resembles the next, and the next but one; the row gain of darks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise._core.coloured import EXPONENTS, banks_of, exponent_of, fading_power, power_of_banks
+from hsnoise.fitting.pixel_joint import UNKNOWN
 from hsnoise.statistics.decomposition import Component, mean_of
-from hsnoise.statistics.pixels.survey import Plane
+from hsnoise.statistics.pixels.banding import Banding
+from hsnoise.statistics.pixels.sample import without_outliers
+from hsnoise.statistics.pixels.survey import Group, Plane, Survey
 
 TOGETHER = 6.0  # chance deviations above which rows are not white
 COMBED = 4.0  # above which a row resembles the next but one more than the next: in one series of rows it is less
 LEAST_ERROR = 0.01  # of an exponent or a share: no spectrum is exactly a power law
+HIT = 2.0  # ratio of the mean temporal variance to that without outliers: hits make most of it
 
 Number = tuple[float, float]
 
@@ -100,3 +104,38 @@ def _banks(correlations: np.ndarray, errors: np.ndarray, rows: int) -> tuple[Num
     apart = np.abs([[numbers(correlations + step) - found for step in of] for of in steps]).max(0)
     error = np.maximum(np.sqrt((apart**2).sum(0)), LEAST_ERROR)
     return (at[0][0], float(error[0])), (at[1][0], float(error[1]))
+
+
+def row_gain_of_darks(
+    found: Survey, c: int, spectrum: RowSpectrum, banding: tuple[str, Banding] | None, growth: float
+) -> tuple[float, float]:
+    """Variance of the row gain, from the growth of the variance of row means with the squared signal; its error.
+
+    Rows that resemble each other, bands, and noise of some frames vary more from exposure to exposure.
+    """
+    groups = found.repeated_darks
+    signal = growth * np.array([g.exposure_s for g in groups])
+    parts = [_rows_over_frames(group, c) for group in groups]
+    y = np.array([one.variance_dn2 for one in parts])
+    error = spectrum.widened * np.array([one.standard_error_dn2 for one in parts]) + 1e-12
+    of_band = banding[1].error_dn2 if banding is not None and banding[0] == "row" else 0.0
+    error = np.maximum(np.hypot(error, of_band), [g.rows_error_dn2(c) for g in groups])
+    if len(groups) < 2 or np.ptp(signal) <= 0:
+        return 0.0, UNKNOWN
+    unit = float(np.abs(signal).max())  # signals of a thousandth of a count would be lost in the inverse
+    design = np.stack([np.ones_like(signal), (signal / unit) ** 2], 1) / error[:, None]
+    covariance = np.linalg.pinv(design.T @ design)
+    theta = covariance @ design.T @ (y / error)
+    error_of_gain = float(np.sqrt(covariance[1, 1])) / unit**2
+    return (float(theta[1]) / unit**2, error_of_gain) if error_of_gain < 1 else (0.0, UNKNOWN)
+
+
+def _rows_over_frames(group: Group, c: int) -> Component:
+    """Variance of rows over frames; where hits make most of the noise, without them: tracks lie in few rows."""
+    planes = group.of(c)
+    found = mean_of([p.components["row_x_frame"] for p in planes])
+    noise_dn2 = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)[0]
+    if np.mean([p.components["temporal"].variance_dn2 for p in planes]) < HIT * noise_dn2:
+        return found
+    cut = float(np.mean([p.halves.rows_dn2 for p in planes]))
+    return replace(found, variance_dn2=min(found.variance_dn2, cut))

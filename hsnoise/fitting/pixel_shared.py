@@ -9,6 +9,7 @@ import numpy as np
 
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_patterns import PATTERNS
+from hsnoise.statistics.pixels.glow import Glow
 from hsnoise.statistics.pixels.taps import Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
@@ -22,6 +23,12 @@ class Channel(Protocol):
 
     patterns: Mapping[str, tuple[float, float, float]]
     temporal_dn2: float
+
+
+class Glowing(Protocol):
+    """A colour's glow, DN/s."""
+
+    glow: Glow | None
 
 
 class Shared(NamedTuple):
@@ -59,6 +66,16 @@ def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]
     if spread > GAINS_THERE * error:
         found["tap_gains"] = {"spread": (spread, float(np.hypot(spread / few, error)))}
     return found
+
+
+def of_glow(channels: Sequence[Glowing], gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """The glow of an amplifier, if all colours have it: the mean of their electrons, the shape of the first."""
+    glows = [one.glow for one in channels if one.glow is not None]
+    if len(glows) < len(channels):
+        return {}
+    rates = np.array([glow.rate_dn_per_s for glow in glows]) / gain[:, None]
+    shape = {name: of for name, of in glows[0]._asdict().items() if name != "rate_dn_per_s"}
+    return {"amplifier_glow": {"rate": (float(rates[:, 0].mean()), _error_of_mean(rates[:, 1])), **shape}}
 
 
 def _of_two(taps: Taps, gain: float) -> dict[str, tuple[float, float]]:

@@ -22,7 +22,7 @@ def gains_differ(result: FitResult) -> Iterator[str]:
     alone = "counts[..., ::2]" if taps.interleaved else f"--roi 0:{rows},0:{columns}, or stack.select,"
     yield (
         f"{_outputs(taps)}, and their gains differ: {_listed(taps.gain, '.3f')} of the mean"
-        f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are means;"
+        f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are of all of them together;"
         f" {alone} fits the first output alone."
     )
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hsnoise._core.types import seconds
 from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
@@ -39,6 +40,8 @@ OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
+LONG_S = 0.5  # of the only dark exposure, from which its dark signal may show
+LEAST_STEPS = 0.8  # of a step of the codes: with less noise rounding is no noise of its own
 MANY_HOT = 0.15  # share of pixels
 STATIC_SHARE = 0.03  # static variance that a pooled fit mistakes for noise, over the temporal variance
 
@@ -46,7 +49,8 @@ STATIC_SHARE = 0.03  # static variance that a pooled fit mistakes for noise, ove
 def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
-    checks = (_withheld, _single_frames, _of_transfer, _clipped, _falling, _of_pooling, disagreements)
+    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _falling, _of_pooling)
+    checks = (_withheld, _single_frames, *coarse, *of_pixels, disagreements)
     grave = [sentence for check in checks for sentence in check(result, found)]
     grave += [*stated(result, seen), *oddities_of(found)]
     moved, shared = tuple(moved_frames(found)), of_the_signal(found.along)
@@ -61,6 +65,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *alone,
         *_fallen_back(result),
         *_coarse_codes(result, found),
+        *_signal_of_one_exposure(result, found),
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found, _has_noisy_pixels(result)),
@@ -270,6 +275,28 @@ def _fallen_back(result: FitResult) -> Iterator[str]:
         yield (
             f"Maximum likelihood did not converge ({result.detail}): these are the numbers of the line fit, which does"
             " not separate dark current from read noise at a single exposure, and takes no account of outliers."
+        )
+
+
+def _signal_of_one_exposure(result: FitResult, found: Survey) -> Iterator[str]:
+    """That the shot noise of a dark signal is in the read noise, where no other exposure tells how much."""
+    if result.transfer is None or found.shortest is None or found.has_exposures:
+        return
+    if found.shortest.exposure_s > LONG_S:
+        yield (
+            f"All darks are of {seconds(found.shortest.exposure_s)}, and the shot noise of their dark signal is in the"
+            " read noise: add bias frames, or darks of another exposure."
+        )
+
+
+def _noise_below_a_step(result: FitResult, found: Survey) -> Iterator[str]:
+    if result.transfer is None or found.code_step == 1:
+        return
+    sigma = float(np.sqrt(min(channel.values[1] for channel in result.transfer.channels)))
+    if sigma < LEAST_STEPS * found.code_step:
+        yield (
+            f"All counts are multiples of {found.code_step} DN, and the noise, {sigma:.3g} DN, is less: divide counts"
+            f" and levels by {found.code_step}, and fit again."
         )
 
 

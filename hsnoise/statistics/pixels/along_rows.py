@@ -132,7 +132,7 @@ def of_the_signal(groups: Sequence[Along]) -> tuple[float, float]:
     # Bands of random phases scatter more than pixels.
     apart = ((shared - design @ both) ** 2).sum(0) / max(len(groups) - 2, 1)
     chance = SIGNIFICANT * np.sqrt(covariance[1, 1] * np.maximum(np.nan_to_num(apart), 1.0))
-    along, down = np.where(np.abs(both[1]) > chance, np.nan_to_num(both[1]), 0.0)
+    along, down = np.nan_to_num(both[1]) * (np.abs(both[1]) > chance).any()
     return float(along), float(down)
 
 

@@ -83,8 +83,7 @@ def levels_of(found: Survey, channel: int, without: np.ndarray | None = None) ->
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
-    moving = ~found.stuck(channel)
-    moving = moving if without is None else moving & ~without
+    moving = kept_of(found, channel, without)
     if moving.sum() < FEWEST_ALIVE:
         return None
     level, variance, peak, whole = (
@@ -94,6 +93,12 @@ def levels_of(found: Survey, channel: int, without: np.ndarray | None = None) ->
     sigma = _pedestal_sigmas([np.mean([p.halves.frame_means_dn for p in g.of(channel)], axis=0) for g in groups])
     sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
     return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
+
+
+def kept_of(found: Survey, channel: int, without: np.ndarray | None = None) -> np.ndarray:
+    """Which sampled pixels `levels_of` keeps [pixel]."""
+    moving = ~found.stuck(channel)
+    return moving if without is None else moving & ~without
 
 
 def is_hot(found: Survey, channel: int) -> np.ndarray:

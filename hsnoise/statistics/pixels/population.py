@@ -87,14 +87,19 @@ def population_of(
         values[2:], errors[2:] = 0.0, np.inf
     body, spread, fraction, rate, tail = values
     below = float(growth[growth < limit - pedestal_dn_per_s].mean())
+    beyond = 0.0
     if fraction > 0:
         # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
         beyond = body - _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
-    else:
-        beyond = float(growth.mean()) - below if spread > 0 else 0.0
+    total = float(growth.mean())
+    if fraction > 0 and total <= below + beyond:  # the log-normal's tail holds more than all pixels have
+        fraction = values[2] = 0.0
+        errors[2:] = np.inf
+    if fraction <= 0:
+        beyond = total - below if spread > 0 else 0.0
     mean = ordinary + beyond
     if fraction > 0:  # keeps the charge of the tail, whatever its shape; moving pedestals are in both means
-        total, scatter = float(growth.mean()), float(growth.std()) / np.sqrt(len(growth))
+        scatter = float(growth.std()) / np.sqrt(len(growth))
         rate = max((total - below - beyond) / fraction, 0.0)
         errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
     shortest = float(pixels.exposure_s.min())

@@ -20,6 +20,7 @@ SURE = 8.0  # standard errors above which quiet pixels differ: telegraph noise t
 NOISIEST = 0.05  # largest share of the pixels that jump or are hit
 SIMULATED = 100_000  # pixels
 FEWEST_LINES, LINES_THERE, LEAST_OF_LINES = 32, 6.0, 0.01  # the last: spread of rows or columns that matters
+FEWEST_OF_TAIL, MOST_STILL = 3, 0.01  # frames, share of the pixels
 MOST_OF_SPREAD = 0.6  # of the deviation of ln sigma that a tail must make: rounding skews log-normal noise by a third
 MOST_TAIL = 0.44
 BESIDE_LINES = 0.5  # of their spread: a smaller one of pixels is what the difference of two nearly equal ones leaves
@@ -65,8 +66,11 @@ def tail_of(found: Survey, channel: int) -> Tail | None:
     noise = [float(np.median(g.pixels(channel, "pair_variance_dn2"))) for g in groups[:2]]
     # Shot noise, which pixels share, would make the logarithms differ by less.
     both, frames = _variances(groups if noise[-1] < ALL_READ * noise[0] else groups[:1], channel, kept)
-    both = both[:, (both > TINY_DN2).all(0)].astype(np.float64)
-    if min(frames) < 2 or both.shape[1] < FEWEST_PIXELS:
+    still = ~(both > TINY_DN2).all(
+        0
+    )  # equal counts in all frames, as quiet pixels have: without them noise looks skewed
+    both = both[:, ~still].astype(np.float64)
+    if min(frames) < FEWEST_OF_TAIL or still.mean() > MOST_STILL or both.shape[1] < FEWEST_PIXELS:
         return None
     a, b = (of - of.mean() for of in np.log(both))
     second, third = a * b / 4, (a + b) * a * b / 16

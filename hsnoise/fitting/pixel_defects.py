@@ -1,0 +1,84 @@
+"""Pixels that stand out, in electrons: hot ones, hits of single frames, jumps of levels; means over the colours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.fitting.pixel_fit import PixelFit, weighted_mean
+from hsnoise.statistics.pixels.population import Population
+
+FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
+
+
+def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:
+    """Hot pixels, if most colours have more than by chance: means over those colours."""
+    hot = [(p, g) for p, g in many if p.hot_fraction[0] > 0 and p.hot_rate[0] > 0]
+    if 2 * len(hot) <= len(many):
+        return {}
+    found = {
+        "fraction": of_colours([p.hot_fraction for p, _ in hot]),
+        "rate": of_colours([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in hot]),
+        "at_readout": of_colours([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in hot]),
+    }
+    heavy = [p.hot_spread for p, _ in hot if p.hot_spread[0] > 0]
+    if 2 * len(heavy) > len(hot):
+        found["spread"] = of_colours(heavy)
+    fano = _fano(pixel)
+    return {"hot_pixels": found if fano is None else found | {"fano": fano}}
+
+
+def warm_of(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
+    """Hot pixels from darks of one exposure: charge of the exposure, or of the readout if the exposure is zero."""
+    many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
+    if not many:
+        return {}
+    fraction = of_colours([warm.fraction for warm, _ in many])
+    charge = of_colours([(warm.extra_dn[0] / g, warm.extra_dn[1] / g) for warm, g in many])
+    tail = of_colours([warm.spread for warm, _ in many])
+    hot = {"fraction": fraction} | ({"spread": tail} if tail[0] > 0 else {})
+    if longest_s > 0:
+        return {"hot_pixels": {**hot, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
+    return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}
+
+
+def rays_of(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """Cosmic rays, if all colours have hits of single frames: means over the colours."""
+    told = [(c.rays, g) for c, g in zip(pixel.channels, gain, strict=True) if c.rays is not None]
+    if len(told) < len(pixel.channels):
+        return {}
+    charge = of_colours([(rays.charge_dn[0] / g, rays.charge_dn[1] / g) for rays, g in told])
+    rate, at_readout = (of_colours([of[i] for of, _ in told]) for i in (0, 2))
+    return {"cosmic_rays": {"rate": rate, "charge": charge, "at_readout": at_readout}}
+
+
+def jumps_of(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """Pixels that jump, if all colours have them, of one kind: means over the colours."""
+    told = [(c.jumps, g) for c, g in zip(pixel.channels, gain, strict=True) if c.jumps is not None]
+    if len(told) < len(pixel.channels) or len({jumps[3:5] for jumps, _ in told}) > 1:
+        return {}
+    amplitude = of_colours([(jumps.amplitude_dn[0] / g, jumps.amplitude_dn[1] / g) for jumps, g in told])
+    fraction, duty = (of_colours([getattr(jumps, name) for jumps, _ in told]) for name in ("fraction", "duty"))
+    spread = float(told[0][0].exponential), np.inf
+    return {"random_telegraph_noise": {"fraction": fraction, "amplitude": amplitude, "duty": duty, "spread": spread}}
+
+
+def _fano(pixel: PixelFit) -> tuple[float, float] | None:
+    """Fano factor of the hot pixels, if significantly below 1; flats give it more precisely than ordinary pixels."""
+    told = []
+    for c, channel in enumerate(pixel.channels):
+        t = channel.transfer
+        if t is None or not np.isfinite(t.hot_gain) or not pixel.determined:
+            continue
+        gain, error = pixel.estimate[c], np.sqrt(pixel.covariance[c, c])
+        ratio = t.hot_gain / gain
+        told.append((ratio, ratio * np.hypot(t.hot_error / t.hot_gain, error / gain)))
+    if not told:
+        return None
+    value, error = weighted_mean(told)
+    return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
+
+
+def of_colours(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of values over the colours and its error; infinite errors are those of values of 0."""
+    values, errors = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    return float(values.mean()), float(np.sqrt((errors**2).sum()) / len(pairs))
