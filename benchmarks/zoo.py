@@ -285,17 +285,21 @@ def row_of(name: str, seed: int) -> tuple[str, ...]:
     seconds, table = time.perf_counter() - began, fit.table
     cells: dict[str, list[str]] = {"gain": [], "read_noise": [], "dark_current": []}
     for parameter, truth in sensor.truth.items():
-        value, error = _mean_dark(table) if parameter == "dark_current.rate" else table[parameter][:2]
+        value, error = _mean_dark(fit, sensor.shape) if parameter == "dark_current.rate" else table[parameter][:2]
         off = f"{100 * (value / truth - 1):+.1f} % ({(value - truth) / error:+.1f})" if truth and error > 0 else "-"
         cells[parameter.partition(".")[0]].append("not determined" if np.isnan(value) or np.isinf(error) else off)
     return name, *("; ".join(of) for of in cells.values()), fit.conclusion.light, f"{seconds:.1f} s"
 
 
-def _mean_dark(table: dict[str, tuple[float, float, str]]) -> tuple[float, float]:
-    """Dark current of the mean pixel, with what hot ones add, and its error."""
+def _mean_dark(fit: hsnoise.FitResult, shape: tuple[int, int]) -> tuple[float, float]:
+    """Dark current of the mean pixel, with what hot ones and a glow add, and its error."""
+    table, glow = fit.table, 0.0
+    if "amplifier_glow" in fit.params:
+        alone = hsnoise.NoiseModel([fit.params["amplifier_glow"]], cfa="mono", shutter="global", exposure_s=1e3)
+        glow = float(np.mean(hsnoise.sample_dark(0, 1, shape, alone))) / 1e3
     (rate, error, _), nothing = table["dark_current.rate"], (0.0, 0.0, "")
     (share, of_share, _), (hot, of_hot, _) = (table.get(f"hot_pixels.{name}", nothing) for name in ("fraction", "rate"))
-    return rate + share * hot, float(np.hypot(error, np.hypot(share * of_hot, of_share * hot)))
+    return rate + share * hot + glow, float(np.hypot(error, np.hypot(share * of_hot, of_share * hot)))
 
 
 def main() -> None:

@@ -168,27 +168,18 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     banding = banding_in(found, c)
     row_gain = partial(row_gain_of_darks, found, c, spectrum, banding)
-    rays, transfer = _rays(found, c) if narrow is None else None, None
+    rays = _rays(found, c) if narrow is None else None
+    at_rest = np.array([1.0, floor, growth]), np.diag([UNKNOWN, floor_error, growth_error]) ** 2
+    if tail is not None:
+        _raise(*at_rest, tail)
+    (values, covariance), transfer, population, glow = at_rest, None, None, None
     if pixels is not None:
         transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
-    values, population, glow = np.array([1.0, floor, growth]), None, None
-    covariance = np.diag([UNKNOWN, floor_error, growth_error]) ** 2
-    if tail is not None:
-        _raise(values, covariance, tail)
-    without, of_without = (1.0, values[1]), covariance[1, 1]
     if transfer is not None and pixels is not None:
-        values, covariance = transfer.values.copy(), transfer.covariance.copy()
-        if jumps is not None:
-            _correct(values, covariance, jumps, raised)
-        if tail is not None:
-            _raise(values, covariance, tail)
         glow = glow_of(found, c)
         of_glow = None if glow is None else glow_of_pixels(glow, found, c)[kept_of(found, c, jumping)]
         population = _population(found, c, pixels, transfer, of_glow)
-        values[2] = population.mean
-        if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
-            # If ordinary pixels do not grow, hot ones only give a bound.
-            values[:2], covariance = without, np.diag([UNKNOWN**2, of_without, covariance[2, 2]])
+        values, covariance = _transferred(transfer, at_rest, population, (jumps, raised), tail)
     if found.code_step > 1:
         coarse = ROUNDING * (found.code_step**2 - 1)
         values[1], floor = max(values[1] - coarse, ROUNDING), max(floor - coarse, ROUNDING)
@@ -225,6 +216,30 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         banding=banding,
         subtracted=subtracted(transfer, (growth, growth_error)),
     )
+
+
+def _transferred(
+    transfer: Transfer,
+    at_rest: tuple[np.ndarray, np.ndarray],
+    population: Population,
+    jumps: tuple[Jumps | None, float],
+    tail: Tail | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gain, variance without signal and growth, with their covariance, by pixel transfer.
+
+    at_rest: the same without it. jumps: and the factor by which they raise the variance.
+    """
+    values, covariance = transfer.values.copy(), transfer.covariance.copy()
+    if jumps[0] is not None:
+        _correct(values, covariance, *jumps)
+    if tail is not None:
+        _raise(values, covariance, tail)
+    values[2] = population.mean
+    if not transfer.ordinary_error < DETERMINED * abs(transfer.ordinary_gain) or transfer.gain <= 0:
+        # If ordinary pixels do not grow, hot ones only give a bound.
+        values[:2] = 1.0, at_rest[0][1]
+        covariance = np.diag([UNKNOWN**2, at_rest[1][1, 1], covariance[2, 2]])
+    return values, covariance
 
 
 def _raised_by(jumps: Jumps, n_frames: int) -> float:

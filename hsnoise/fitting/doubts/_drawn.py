@@ -33,6 +33,8 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
     """Sentences on measured noise that the fitted model does not reproduce; none without a gain."""
     if result.stack is None or not result.has_gain or found.shortest is None:
         return
+    if "amplifier_glow" in result.params:  # the middle, where frames are drawn, has less of it
+        found = _of_the_middle(result.stack, found)
     chosen = _chosen(found)
     if any(plane.narrow_dn is not None for i in chosen for plane in found.groups[i].planes):
         return  # rounding dominates noise below a count, and affects the two unequally
@@ -71,6 +73,15 @@ def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Su
     ]
     taken = {"cfa": stack.cfa, "shutter": stack.shutter, "white_level": stack.white_level}
     return survey(FrameStack([np.asarray(of) for of in counts], exposure_s=exposures_s, **taken))
+
+
+def _of_the_middle(stack: FrameStack, found: Survey) -> Survey:
+    """A survey of the pixels that `_middle` says; `found` where frames are drawn as large as the sensor."""
+    if _middle(stack) is None:
+        return found
+    starts = [(size - drawn) // 4 * 2 for size, drawn in zip(stack.shape, SHAPE, strict=True)]
+    rows, columns = ((start, start + drawn) for start, drawn in zip(starts, SHAPE, strict=True))
+    return survey(stack.select(rows=rows, columns=columns))
 
 
 def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:

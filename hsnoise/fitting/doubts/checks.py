@@ -180,7 +180,7 @@ def _coupled(shared: tuple[float, float]) -> Iterator[str]:
 def _moved_pedestals(result: FitResult) -> Iterator[str]:
     """Pedestals that moved; the gain then does not depend on them."""
     pixel = result.transfer
-    if "black_clamp" in result.params:
+    if "black_clamp" in result.params or any(gains_differ(result)):  # outputs of other gains look like a pedestal
         return
     for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
         t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
@@ -280,7 +280,7 @@ def _fallen_back(result: FitResult) -> Iterator[str]:
 
 def _signal_of_one_exposure(result: FitResult, found: Survey) -> Iterator[str]:
     """That the shot noise of a dark signal is in the read noise, where no other exposure tells how much."""
-    if result.transfer is None or found.shortest is None or found.has_exposures:
+    if result.transfer is None or not result.has_gain or found.shortest is None or found.has_exposures:
         return
     if found.shortest.exposure_s > LONG_S:
         yield (

@@ -66,9 +66,7 @@ def tail_of(found: Survey, channel: int) -> Tail | None:
     noise = [float(np.median(g.pixels(channel, "pair_variance_dn2"))) for g in groups[:2]]
     # Shot noise, which pixels share, would make the logarithms differ by less.
     both, frames = _variances(groups if noise[-1] < ALL_READ * noise[0] else groups[:1], channel, kept)
-    still = ~(both > TINY_DN2).all(
-        0
-    )  # equal counts in all frames, as quiet pixels have: without them noise looks skewed
+    still = ~(both > TINY_DN2).all(0)  # of quiet pixels, equal in all frames: without them noise looks skewed
     both = both[:, ~still].astype(np.float64)
     if min(frames) < FEWEST_OF_TAIL or still.mean() > MOST_STILL or both.shape[1] < FEWEST_PIXELS:
         return None
