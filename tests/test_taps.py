@@ -98,3 +98,12 @@ def test_even_and_odd_columns_of_two_converters(known, rng):
     assert abs(fit.params["odd_even_pattern"].offset - 1.5 / 0.8) < 0.3
     assert "column_fixed_pattern" not in fit.added
     assert any("Even and odd columns are read by outputs of their own" in doubt for doubt in fit.doubts)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_on_a_lattice_have_no_seam(seed):
+    """Medians of means of six counts are all the same; a step of 5e-6 DN had been larger than any other (IMX541)."""
+    rng = np.random.default_rng(seed)
+    offsets = 10.3 + 0.07 * rng.standard_normal((160, 400))
+    counts = np.round(offsets + 0.87 * rng.standard_normal((6, 160, 400))).clip(0).astype(np.uint16)
+    assert hsnoise.fit(counts, exposure_s=0.0, pixels="differ").transfer.taps is None

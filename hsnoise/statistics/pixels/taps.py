@@ -16,7 +16,7 @@ SEAM = 8.0  # typical differences between neighbouring runs of lines
 REACH, LEAST_REACH = 16, 4  # lines on each side of a seam
 FEWEST_PLACES = 24  # elsewhere, which tell the typical difference
 MOST = 0.6  # share of the new seams of a layout that must be there
-LEAST = 1e-4  # of the noise's variance: a difference of even and odd columns that changes no frame visibly
+LEAST, LEAST_NOISE = 1e-4, 3e-3  # of the noise's variance, of the noise: differences that change no frame visibly
 PIECES = 8  # of a row, in all of which even columns lie on one side of odd ones
 FILLED = 0.7  # of full scale: above it the response may bend
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
@@ -63,7 +63,7 @@ def taps_of(found: Survey) -> Taps | None:
     group = found.shortest
     if group is None or not found.is_whole:
         return None
-    level, noise = _map(group, "level_dn"), np.log(np.maximum(_map(group, "pair_variance_dn2"), 1e-6))
+    level, noise = _level_and_noise(group)
     rows, columns = (max(_layout(of, axis, found) for of in (level, noise)) for axis in (0, 1))
     interleaved = rows * columns == 1 and any(_alternates(of) for of in (level, noise))
     if rows * columns == 1 and not interleaved:
@@ -73,9 +73,21 @@ def taps_of(found: Survey) -> Taps | None:
         columns, bounds[1] = 2, [slice(0, None, 2), slice(1, None, 2)]
     offset, variance, _ = _moments(group, bounds)
     offset -= offset.mean()
-    if interleaved and not _alternates(noise) and offset.var() < LEAST * variance.mean():
+    noise_dn = np.sqrt(np.maximum(variance, 0.0))
+    if offset.var() < LEAST * variance.mean() and noise_dn.std() < LEAST_NOISE * noise_dn.mean():
         return None
-    return Taps(rows, columns, offset, np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds), interleaved)
+    return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds), interleaved)
+
+
+def _level_and_noise(group: Group) -> tuple[np.ndarray, np.ndarray]:
+    """Level, DN, and logarithm of the variance of pixels, in which seams are looked for.
+
+    Means of few whole counts lie on a lattice, on which medians would not differ at all: they are blurred.
+    """
+    level, variance = _map(group, "level_dn"), _map(group, "pair_variance_dn2")
+    level += np.random.default_rng(0).uniform(-0.5, 0.5, level.shape) / group.n_frames
+    blurred = variance * np.random.default_rng(1).uniform(0.8, 1.25, variance.shape)
+    return level, np.log(np.maximum(blurred, 0.1 * float(np.median(variance)) + 1e-6))
 
 
 def levelled(found: Survey, taps: Taps) -> Survey:
