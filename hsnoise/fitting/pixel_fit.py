@@ -51,6 +51,7 @@ MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps 
 RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
+LEAST_SIGNAL_DN = 1.0  # of a flat: with less, rounding is all that differs
 LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
@@ -309,7 +310,7 @@ def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) ->
             continue
         signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
         highest = group.pixels(c, "highest")
-        if signal <= 0 or (highest == highest.max()).mean() > MOST_SATURATED:
+        if signal < LEAST_SIGNAL_DN or (highest == highest.max()).mean() > MOST_SATURATED:
             continue
         rows = len(found.sampled_rows) * plane_rows(found)
         levels = [p.halves.level_dn for p in group.of(c)]
