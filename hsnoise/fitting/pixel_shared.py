@@ -10,11 +10,10 @@ import numpy as np
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.statistics.pixels.glow import Glow
-from hsnoise.statistics.pixels.taps import Taps
+from hsnoise.statistics.pixels.taps import GAINS_APART, Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
 SURE = 10.0  # standard errors, at least, of offsets that were found by their seams
-GAINS_THERE = 5.0  # standard errors of the spread of the gains of outputs
 AFTER = 12.0  # by which chi2 must be less for a pattern of one size in DN than for one of one size in electrons
 
 
@@ -63,7 +62,7 @@ def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]
     few = np.sqrt(2 * (taps.offset_dn.size - 1))
     sigma, (spread, error) = float(taps.offset_dn.std(ddof=1)) / gain, taps.gain_spread
     found = {"tap_offsets": {"sigma": (sigma, sigma / few)}}
-    if spread > GAINS_THERE * error:
+    if taps.gains_differ:
         found["tap_gains"] = {"spread": (spread, float(np.hypot(spread / few, error)))}
     return found
 
@@ -82,7 +81,7 @@ def _of_two(taps: Taps, gain: float) -> dict[str, tuple[float, float]]:
     """Offset and gain of the second of two outputs less those of the first."""
     offset, mismatch, errors = np.diff(taps.offset_dn[0])[0], np.diff(taps.gain[0])[0], taps.gain_error[0]
     found = {"offset": (float(offset) / gain, abs(float(offset)) / gain / SURE)}
-    if abs(mismatch) > GAINS_THERE * np.hypot(*errors):  # False of NaN: no signal
+    if abs(mismatch) > GAINS_APART * np.hypot(*errors):  # False of NaN: no signal
         found["gain_mismatch"] = (float(mismatch), float(np.hypot(*errors)))
     return found
 

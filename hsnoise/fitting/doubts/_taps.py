@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hsnoise.fitting.pixel_shared import GAINS_THERE
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.taps import Taps
 
@@ -16,7 +15,7 @@ DIFFER = 0.02  # largest relative difference of gains that is no doubt
 def gains_differ(result: FitResult) -> Iterator[str]:
     """That no pixel may have the gain of the table."""
     taps = _taps(result)
-    if taps is None or not _sure(taps) or np.ptp(taps.gain) < DIFFER:
+    if taps is None or not taps.gains_differ or np.ptp(taps.gain) < DIFFER:
         return
     rows, columns = (n // of for n, of in zip(result.summary.shape, (taps.rows, taps.columns), strict=True))
     alone = "counts[..., ::2]" if taps.interleaved else f"--roi 0:{rows},0:{columns}, or stack.select,"
@@ -39,11 +38,6 @@ def outputs(result: FitResult) -> Iterator[str]:
 
 def _taps(result: FitResult) -> Taps | None:
     return None if result.transfer is None else result.transfer.taps
-
-
-def _sure(taps: Taps) -> bool:
-    spread, error = taps.gain_spread
-    return spread > GAINS_THERE * error
 
 
 def _outputs(taps: Taps) -> str:

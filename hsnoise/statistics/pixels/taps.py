@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise.statistics.pixels.classes import FILLED
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.survey import Group, Plane, Survey
 
@@ -18,10 +19,11 @@ FEWEST_PLACES = 24  # elsewhere, which tell the typical difference
 MOST = 0.6  # share of the new seams of a layout that must be there
 LEAST, LEAST_NOISE = 1e-4, 3e-3  # of the noise's variance, of the noise: differences that change no frame visibly
 PIECES = 8  # of a row, in all of which even columns lie on one side of odd ones
-FILLED = 0.7  # of full scale: above it the response may bend
+GAINS_APART = 5.0  # standard errors of the spread of gains
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
 
 Bounds = list[slice]
+Moments = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Taps(NamedTuple):
@@ -57,6 +59,12 @@ class Taps(NamedTuple):
         spread = float(np.sqrt(max(logarithm.var(ddof=1) - error_2, 0.0)))
         return spread, float(np.sqrt(error_2 / (self.gain.size - 1)))
 
+    @property
+    def gains_differ(self) -> bool:
+        """Whether the gains of the outputs differ beyond chance."""
+        spread, error = self.gain_spread
+        return spread > GAINS_APART * error
+
 
 def taps_of(found: Survey) -> Taps | None:
     """The outputs of a sensor, from its shortest darks of several frames; None if there is one, or nothing tells."""
@@ -71,12 +79,12 @@ def taps_of(found: Survey) -> Taps | None:
     bounds = [_bounds(found, axis, count) for axis, count in enumerate((rows, columns))]
     if interleaved:
         columns, bounds[1] = 2, [slice(0, None, 2), slice(1, None, 2)]
-    offset, variance, _ = _moments(group, bounds)
-    offset -= offset.mean()
+    at_rest = level_dn, variance, _ = _moments(group, bounds)
+    offset = level_dn - level_dn.mean()
     noise_dn = np.sqrt(np.maximum(variance, 0.0))
     if offset.var() < LEAST * variance.mean() and noise_dn.std() < LEAST_NOISE * noise_dn.mean():
         return None
-    return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds), interleaved)
+    return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds, at_rest), interleaved)
 
 
 def _level_and_noise(group: Group) -> tuple[np.ndarray, np.ndarray]:
@@ -171,10 +179,13 @@ def _is_seam(profile: np.ndarray, edge: int, edges: Iterable[int]) -> bool:
     return bool(here[at == edge][0] > SEAM * typical and np.abs(at[near][here[near].argmax()] - edge) <= 1)
 
 
-def _gains(found: Survey, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray]:
-    """Gains of blocks relative to their mean, by the variance that signal adds, and errors; weighted means."""
+def _gains(found: Survey, bounds: list[Bounds], at_rest: Moments) -> tuple[np.ndarray, np.ndarray]:
+    """Gains of blocks relative to their mean, by the variance that signal adds, and errors; weighted means.
+
+    at_rest: moments of the blocks in the shortest darks.
+    """
     ratios, errors = [], []
-    level, variance, chance = _moments(found.shortest, bounds)
+    level, variance, chance = at_rest
     for group in found.groups:
         if group.n_frames < 2 or group is found.shortest:
             continue
@@ -192,7 +203,7 @@ def _gains(found: Survey, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray]
     return (weight * ratios).sum(0) / weight.sum(0), weight.sum(0) ** -0.5
 
 
-def _moments(group: Group, bounds: list[Bounds]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _moments(group: Group, bounds: list[Bounds]) -> Moments:
     """Level of the typical pixel, mean variance without outliers, and its error, of each block."""
     variance = _map(group, "pair_variance_dn2")
     both = [
