@@ -11,9 +11,9 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
-from hsnoise.criticism import held_out
 from hsnoise.criticism.compare import compared
 from hsnoise.criticism.diagnose import diagnosed
+from hsnoise.criticism.held_out import Judge
 from hsnoise.fitting.simulated import fit_synthetic
 from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
@@ -114,7 +114,7 @@ def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
     tuned = keys_of(lambda: diagnosed(MODEL, portion, draws=16, seed=0, tick=lambda: None))
     refitted = keys_of(lambda: fit_synthetic(base, portion, base.params.add(fx.RowNoise(3.0))))
     judged = keys_of(lambda: compared(truth, portion, draws=8, seed=0))
-    unseen = keys_of(lambda: held_out.log_likelihood(truth, portion, 0, draws=8))
+    unseen = keys_of(lambda: Judge(portion, True, 0).score(truth))
     for one, other in combinations([tuned, refitted, judged, unseen], 2):
         assert one and other and not one & other
 

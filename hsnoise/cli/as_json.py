@@ -86,6 +86,7 @@ def _(found: Story) -> dict[str, Any]:
             "error": step.comparison.error,
             "worst_group": step.comparison.worst_group,
             "held_out_nats": step.held_out,
+            "held_out_error_nats": step.held_out_error,
         }
         for step in found.steps
     ]

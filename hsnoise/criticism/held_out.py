@@ -1,17 +1,25 @@
-"""Frames that no fit of `improve` has seen: the guard against over-fitting."""
+"""Frames that no fit of `improve` has seen, and the one score by which additions are judged on them."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from hsnoise.criticism import sentences
+from hsnoise.criticism.outcomes import Improvement
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
+from hsnoise.statistics.structure import structure
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
-DRAWS = 40  # of the likelihood
+DRAWS, LEAST_DRAWS, BATCHES = 96, 48, 4  # of a model that is judged; batches of them tell the error of the simulation
+MOST_DRAWN = 300_000_000  # pixels of the draws of a model
+SIDE_DRAWS = 40
 
 
 def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
@@ -33,16 +41,86 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     return sentences.frames_apart(kept, held_out.n_frames)
 
 
-def log_likelihood(
-    model: NoiseModel, portion: Portion | None, seed: int, purpose: Purpose = Purpose.HELD_OUT, draws: int = DRAWS
-) -> float:
-    """Gaussian synthetic log-likelihood of the statistics of a portion, by draws that no fit has seen, nats.
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """The frames by which additions are judged: darks that no fit has seen, and all flats.
 
-    NaN without a portion: there were too few frames to hold some out.
+    The score of a model is the log density of the statistics of these frames, normal with the mean and covariance of
+    its draws: a proper score, whose difference between two models is a likelihood ratio. Of frames that neither model
+    has seen, chance alone makes it c nats or more with probability exp(-c) at most, however few frames there are. Flats
+    are too few to be spared, and darks may be, too: of frames that a fit has seen, each fitted number costs a nat, by
+    which a model comes nearer without describing anything (Akaike, IEEE Trans. Autom. Control 19, 1974).
+
+    Attributes:
+        portion: these frames, and how many came before them.
+        unseen: whether a fit has seen none of its darks.
+        seed: of the draws.
+        kept: what was drawn of the frames alone, and of the frames after those before them.
     """
-    if portion is None:
-        return float("nan")
-    simulator = Simulator(model, portion, key_for(seed, purpose))
-    own = simulator.reference(model, draws)
-    z = own.z(simulator.measured.values)
-    return float(own.distribution.log_density(z) - np.log(own.deviation).sum())
+
+    portion: Portion
+    unseen: bool
+    seed: int
+    kept: tuple[dict, dict] = field(default_factory=lambda: ({}, {}))
+
+    @staticmethod
+    def of(fitted: FrameStack, held_out: FrameStack | None, seed: int) -> Judge:
+        """Of the frames of a fit, and of the darks held out, if any."""
+        if held_out is None:
+            return Judge(Portion.of(fitted), False, seed)
+        before = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
+        flats = [i for i, kind in enumerate(fitted.kind) if kind == "flat"]
+        stack = FrameStack.join(held_out, fitted.select(exposures=flats)) if flats else held_out
+        return Judge(Portion.of(stack, before=(*before, *[0] * len(flats))), True, seed)
+
+    @cached_property
+    def without_flats(self) -> Judge:
+        """The same without flats."""
+        return replace(self, portion=self.portion.darks, kept=({}, {}))
+
+    def score(self, model: NoiseModel) -> float:
+        """Log score of a model, nats."""
+        simulator = self._simulator(model)
+        return log_score(simulator.reference(model, self._draws(simulator)), simulator.measured.values)
+
+    def improvement(self, before: NoiseModel, after: NoiseModel, numbers: int) -> Improvement:
+        """By how much one model predicts the frames better than another; numbers: how many more were fitted for it."""
+        simulator = self._simulator(before, after)
+        draws, values = self._draws(simulator), simulator.measured.values
+        old, new = (simulator.reference(model, draws) for model in (before, after))
+        batches = np.array_split(np.arange(draws), BATCHES)
+        parts = [log_score(new.of_draws(some), values) - log_score(old.of_draws(some), values) for some in batches]
+        cost = 0 if self.unseen and "flat" not in self.portion.frames.kind else numbers
+        error = float(np.std(parts, ddof=1) / np.sqrt(BATCHES))
+        return Improvement(log_score(new, values) - log_score(old, values), error, cost)
+
+    def _simulator(self, *models: NoiseModel) -> Simulator:
+        """Draws of the frames; with those before them if something depends on the number of a frame."""
+        in_series = any(effect.in_series for model in models for effect in model)
+        portion = self.portion if in_series else replace(self.portion, before=())
+        # One level for all: each model's own would give them different statistics.
+        measure = partial(structure, black_level_dn=self._level_dn)
+        key, kept = key_for(self.seed, Purpose.HELD_OUT), self.kept[in_series]
+        return Simulator(models[0], portion, key, measure=measure, kept=kept)
+
+    @cached_property
+    def _level_dn(self) -> float:
+        darks = self.portion.darks.frames
+        return float(darks.frame(int(np.argmin(darks.exposure_s)), 0).mean())
+
+    @staticmethod
+    def _draws(simulator: Simulator) -> int:
+        rows, columns = simulator.portion.frames.shape
+        drawn = (sum(simulator.portion.frames.n_frames) + sum(simulator.portion.before)) * rows * columns
+        return int(np.clip(MOST_DRAWN // drawn, LEAST_DRAWS, DRAWS))
+
+
+def log_score(own: Reference, values: np.ndarray) -> float:
+    """Log density of statistics under the normal distribution of a model's draws, nats."""
+    return float(own.distribution.log_density(own.z(values)) - np.log(own.deviation).sum())
+
+
+def score_of_side(model: NoiseModel, portion: Portion, seed: int) -> float:
+    """Log score of a model with an effect on one side of the gain, on the frames that were fitted, nats."""
+    simulator = Simulator(model, portion, key_for(seed, Purpose.SIDE))
+    return log_score(simulator.reference(model, SIDE_DRAWS), simulator.measured.values)

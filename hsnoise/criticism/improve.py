@@ -13,17 +13,18 @@ import numpy as np
 from hsnoise._core.arguments import callback, seed_of
 from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
-from hsnoise.criticism.acceptance import is_there, is_too_little, why_worse
+from hsnoise.criticism.acceptance import is_too_little, judged
 from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
 from hsnoise.criticism.closing import closed, repeated_darks
 from hsnoise.criticism.compare import DRAWS, Comparison, compared, with_shares
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.finding import Diagnosis
-from hsnoise.criticism.held_out import log_likelihood, split_frames, split_in_words
+from hsnoise.criticism.held_out import Judge, score_of_side, split_frames, split_in_words
 from hsnoise.criticism.limit import NO_LIMIT, Limit, TimeIsUp
 from hsnoise.criticism.outcomes import (
     Ended,
     Ending,
+    Improvement,
     Refusal,
     Refused,
     Side,
@@ -44,7 +45,6 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits
 from hsnoise.simulation.portion import Portion
-from hsnoise.simulation.simulator import Purpose
 
 log = logging.getLogger(__name__)
 
@@ -128,8 +128,8 @@ def improved(
     portion = Portion.of(fitted)
     _check_start(model, candidates, portion, seed)
     limit = Limit.of(max_minutes, max_steps)
-    unseen = None if held_out is None else Portion.of(held_out)
-    work, split = _Work(fitted, portion, unseen, seed, tell, limit, model is not None), split_in_words(fitted, held_out)
+    judge, split = Judge.of(fitted, held_out, seed), split_in_words(fitted, held_out)
+    work = _Work(fitted, portion, judge, seed, tell, limit, model is not None)
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
@@ -163,13 +163,13 @@ def improved(
 class _Work:
     """What every step needs.
 
-    fitted: frames to fit, and the portion of them that is drawn; held_out: frames that no fit sees; tell: gets events;
-    given: whether the user chose the effects of the first model.
+    fitted: frames to fit, and the portion of them that is drawn; judge: of additions; tell: gets events; given: whether
+    the user chose the effects of the first model.
     """
 
     fitted: FrameStack
     portion: Portion
-    held_out: Portion | None
+    judge: Judge
     seed: int
     tell: Callable[[Event], Any]
     limit: Limit = NO_LIMIT
@@ -188,7 +188,8 @@ class _Work:
         """The same work for steps of this fit: without flats if the gain is unknown."""
         if of.has_gain:
             return self
-        return replace(self, portion=self.portion.without_flats("the gain is not determined, and flats need it"))
+        portion = self.portion.without_flats("the gain is not determined, and flats need it")
+        return replace(self, portion=portion, judge=self.judge.without_flats)
 
     def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
         """Diagnose the last step, and append one more; if there is none, how the story ends.
@@ -228,13 +229,12 @@ class _Work:
         return tick
 
     def step(self, result: FitResult, added: str | None, steps: Sequence[Step], draws: int = DRAWS) -> Step:
-        """The step after `steps`."""
+        """The step after `steps`; what the judge says of it is left open."""
         tick = self.counter(_stage("comparing with the model's samples", steps), draws)
         comparison = compared(result.params, self.portion, draws=draws, seed=self.seed, tick=tick)
         comparison = with_shares(comparison, result.params, self.portion, self.seed)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
-        unseen = log_likelihood(result.params, self.held_out, self.seed, draws=draws)
-        return Step(result, comparison, None, added, unseen, _moved(steps[-1].fit, result) if steps else ())
+        return Step(result, comparison, None, added, moved=_moved(steps[-1].fit, result) if steps else ())
 
     def started(self, first: FitResult) -> list[Step]:
         """The first steps of a fit or, if it has no gain, of one that follows each pixel if that comes nearer."""
@@ -250,6 +250,9 @@ class _Work:
         for i, name in enumerate(first.added):
             self.say(_stage(f"adding {name}, as measured", steps))
             steps.append(self.step(first.without(first.added[i + 1 :]), name, steps, draws[i + 1]))
+        if self.judge.unseen:
+            for i in {0, len(steps) - 1}:  # nothing depends on those between
+                steps[i] = replace(steps[i], held_out=self.judge.score(steps[i].fit.params))
         return [*steps[:-1], replace(steps[-1], fit=replace(first, added=()))]
 
     def pixels_followed(self, steps: Sequence[Step]) -> FitResult | None:
@@ -286,34 +289,25 @@ class _Work:
         """The first candidate with which the model is better, as a step, and why those before it were left out."""
         refused: dict[str, Refusal] = {}
         for candidate in candidates:
-            step = self.with_one_more(steps, candidate)
-            refusal = None if step is None else self.refusal(candidate.effect, step, steps[-1])
-            if step is not None and refusal is None:
+            found = self.with_one_more(steps, candidate)
+            why = (
+                Refusal(Refused.NOT_FITTED)
+                if found is None
+                else judged(self.judge, steps[-1].fit, found[0], candidate.name)
+            )
+            if isinstance(why, Improvement):
+                step = self.step(found[0], candidate.name, steps)
+                held_out = steps[-1].held_out + why.nats  # NaN if no frames are held out
+                step = replace(step, held_out=held_out, held_out_error=why.error, ahead=found[1])
                 return replace(step, fit=rechecked(step.fit, self.fitted)), refused
-            refused[candidate.name] = refusal or Refusal(Refused.NOT_FITTED)
-            self.say(Event(f"{candidate.name} is left out, {sentences.refusal(refused[candidate.name])}"))
+            refused[candidate.name] = why
+            self.say(Event(f"{candidate.name} is left out: {sentences.refusal(why)}"))
         return None, refused
 
-    def refusal(self, effect: AbstractEffect, step: Step, before: Step) -> Refusal | None:
-        """Why the step with the effect is rejected; None if it is kept."""
-        worse = why_worse(step, before)
-        if worse is not None:
-            return worse
-        if not is_there(effect, step.fit):
-            return Refusal(Refused.ZERO)
-        return None if self.needs(effect.name, step) else Refusal(Refused.NO_CHANGE)
+    def with_one_more(self, steps: list[Step], candidate: Candidate) -> tuple[FitResult, float] | None:
+        """A fit with the candidate, on the side of the gain where it fits better, and by how much, nats.
 
-    def needs(self, name: str, step: Step) -> bool:
-        """Whether some group fits worse without the effect; if none does, only refitting the others helped."""
-        without = compared(step.fit.params.remove(name), self.portion, seed=self.seed).groups
-        return any(
-            without[g] - misfit > rules.NEEDED * max(misfit, 1.0) for g, misfit in step.comparison.groups.items()
-        )
-
-    def with_one_more(self, steps: list[Step], candidate: Candidate) -> Step | None:
-        """The model with the candidate, on the side of the gain where it fits better; None if it cannot be fitted.
-
-        `diagnose` judges the side from a base fit that the effect has biased.
+        None if it cannot be fitted. `diagnose` judges the side from a base fit that the effect has biased.
         """
         fits: list[FitResult] = []
         for effect in _sides(candidate.effect):
@@ -324,13 +318,10 @@ class _Work:
                 fits.append(_fit_with(effect, steps, self, self.counter(stage)))
             except (RuntimeError, ValueError) as error:
                 self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
-        if not fits:
-            return None
-        if len(fits) == 1:
-            return self.step(fits[0], candidate.name, steps)
-        values = [log_likelihood(one.params, self.portion, self.seed, Purpose.SIDE) for one in fits]
-        step = self.step(fits[int(np.argmax(values))], candidate.name, steps)
-        return replace(step, ahead=abs(values[0] - values[1]))
+        if len(fits) < 2:
+            return (fits[0], float("nan")) if fits else None
+        values = [score_of_side(one.params, self.portion, self.seed) for one in fits]
+        return fits[int(np.argmax(values))], abs(values[0] - values[1])
 
 
 def _stage(what: str, steps: Sequence[Step]) -> Event:

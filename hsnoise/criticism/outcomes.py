@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from hsnoise.criticism import rules
 from hsnoise.effects import AbstractEffect
 
 
@@ -36,24 +37,35 @@ class Refused(StrEnum):
     """Why a candidate was left out."""
 
     NOT_FITTED = "not fitted"
-    NOT_CONVERGED = "not converged"  # and the error hardly fell
-    STATISTICS_WORSE = "statistics worse"
-    HELD_OUT_WORSE = "held-out frames worse"
-    BUDGET_WORSE = "noise budget worse"
-    ZERO = "compatible with zero"
+    NO_BETTER = "no better"  # are frames predicted with it
     NO_CHANGE = "no change by itself"
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """Why a candidate was left out, with the error before and after.
+class Improvement:
+    """By how much one model predicts frames better than another.
 
-    Or with the held-out log-likelihood, nats, or the share of the variance that is wrong.
+    Attributes:
+        nats: difference of their log scores; error: its standard error, by how the simulation of both scatters.
+        cost: nats that it has to exceed, for numbers that were fitted to some of the same frames.
     """
 
+    nats: float
+    error: float
+    cost: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is beyond the scatter of its simulation, and beyond chance."""
+        return self.nats - self.cost > rules.PREDICTS + rules.PREDICTS_SIGMA * self.error
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a candidate was left out; improvement: what it would have gained, None if it was not fitted."""
+
     why: Refused
-    before: float = math.nan
-    after: float = math.nan
+    improvement: Improvement | None = None
 
 
 @dataclass(frozen=True)

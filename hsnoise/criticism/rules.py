@@ -31,11 +31,9 @@ MISFIT_LEFT, MISFIT = 3.5, 4.5
 SHARE_LEFT, MOST_LEFT = 0.05, 10.0
 HALF = 0.5  # share of a misfit that must go for an effect to be part of the explanation
 
-THERE_SIGMA = 2.0  # standard errors from absent, at least, of an effect that is kept: 95 %
-NEEDED = 0.1  # share of the misfit of some group that must come back without an effect
-WORSE = -2.0  # nats of held-out likelihood that a step may cost: the scatter of its simulation
-GROWTH, TOTAL_FALLS = 1.25, 0.95  # factors: the worst group may grow so far where all together fall so far
-BUDGET_GROWTH = 0.1  # of the whole variance: so much more of a component may not be wrong after a step
+# Nats of log score on frames that no fit has seen, from which an addition is kept: a likelihood ratio comes there by
+# chance in 5 % at most (Markov's inequality), beyond so many errors of its simulation.
+PREDICTS, PREDICTS_SIGMA = math.log(20), 2.0
 MOVED_SIGMA = 2.0  # standard errors from which a base parameter has moved: 95 %
 
 NOTABLE_Z = 4.0  # deviations of a single statistic among 300 that are worth a sentence: 1 in 50 right models has one

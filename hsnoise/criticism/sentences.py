@@ -35,11 +35,7 @@ NEGLIGIBLE = 1e-3  # of the variance: a component that is off by less is not tol
 UNITS = {Ended.MINUTES: "minute", Ended.STEPS: "addition"}  # of a limit
 REFUSED = {
     Refused.NOT_FITTED: "could not be fitted",
-    Refused.NOT_CONVERGED: "no fit with it converged, and the error hardly fell ({went})",
-    Refused.STATISTICS_WORSE: "statistics fit worse with it (error {went})",
-    Refused.HELD_OUT_WORSE: "held-out frames fit worse with it, by {less:.1f} nats",
-    Refused.BUDGET_WORSE: "with it a component of the noise that was right is off by {share:.0f} % of the variance",
-    Refused.ZERO: "came out compatible with zero",
+    Refused.NO_BETTER: "predicts the frames no better",
     Refused.NO_CHANGE: "made no difference by itself",
 }
 
@@ -210,8 +206,15 @@ def errors_so_far(errors: Sequence[float]) -> str:
 
 def refusal(of: Refusal) -> str:
     """Why a candidate was left out."""
-    went = f"{number(of.before)} -> {number(of.after)}"
-    return REFUSED[of.why].format(went=went, less=of.before - of.after, share=100 * of.after)
+    if of.improvement is None:
+        return REFUSED[of.why]
+    cost = f", of which chance gives {of.improvement.cost:.0f}" if of.improvement.cost else ""
+    return f"{REFUSED[of.why]} ({gained(of.improvement.nats, of.improvement.error)}{cost})"
+
+
+def gained(nats: float, error: float) -> str:
+    """By how much frames are predicted better."""
+    return f"{nats:+.1f} ± {error:.1f} nats"
 
 
 def ended_in_short(ending: Ending, missing: str) -> str:

@@ -33,18 +33,20 @@ class Step:
     Attributes:
         fit, comparison, diagnosis: of the model at the start of this step (diagnosis None at the end).
         added: name of the effect that was added to reach this model; None for the first.
-        held_out: synthetic log-likelihood of the held-out frames, nats; NaN without any.
+        held_out: log score of the held-out frames, nats; NaN without any.
         moved: base parameters that changed by more than two standard errors in this step, in words.
         ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
+        held_out_error: standard error of the change of `held_out` from the step before, by its simulation, nats.
     """
 
     fit: FitResult
     comparison: Comparison
     diagnosis: Diagnosis | None
     added: str | None
-    held_out: float
-    moved: tuple[str, ...]
+    held_out: float = float("nan")
+    moved: tuple[str, ...] = ()
     ahead: float = float("nan")
+    held_out_error: float = float("nan")
 
     @property
     def sizes(self) -> tuple[str, ...]:

@@ -36,12 +36,6 @@ class ParameterSpec:
         """Whether a fit leaves a parameter of this value where it is."""
         return value in (self.low, self.high) if self.held == "at bounds" else self.held
 
-    def from_absent(self, value: float, error: float = 0.0) -> tuple[float, float]:
-        """Distance of a value from absent, and its standard error; 1/value where infinity is absent."""
-        if math.isinf(self.absent):
-            return 1 / value, error / value**2
-        return value - self.absent, error
-
     def scaled(self, value: np.ndarray, factor: float) -> np.ndarray:
         """The value `factor` times as far from absent, as far as the bounds allow."""
         grown = value / factor if math.isinf(self.absent) else self.absent + (value - self.absent) * factor

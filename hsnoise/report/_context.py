@@ -11,7 +11,7 @@ import numpy as np
 
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.types import seconds, unit_in_words
-from hsnoise.criticism import Comparison, Diagnosis, Step, Story
+from hsnoise.criticism import Comparison, Diagnosis, Step, Story, sentences
 from hsnoise.criticism.compare import nearer
 from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.criticism.story import together
@@ -238,4 +238,6 @@ def _why(before: Step, after: Step) -> list[str]:
 
 def _gain(before: Step, after: Step) -> str:
     change = after.held_out - before.held_out
-    return f"{change:+.1f} nats" if np.isfinite(change) else ""
+    if not np.isfinite(change):
+        return ""
+    return sentences.gained(change, after.held_out_error) if after.held_out_error > 0 else f"{change:+.1f} nats"

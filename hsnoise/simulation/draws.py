@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import jax
@@ -68,21 +69,22 @@ def black_level_of(model: NoiseModel) -> np.ndarray:
     return np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(n)
 
 
-def draw_capture(key: RandomKey | int, model: NoiseModel, like: FrameStack) -> FrameStack:
+def draw_capture(key: RandomKey | int, model: NoiseModel, like: FrameStack, before: Sequence[int] = ()) -> FrameStack:
     """A capture drawn from `model` as `like` was taken: one sensor, every frame new, flats in light as bright.
 
-    key: a random key, or its seed.
+    key: a random key, or its seed; before: for each exposure, how many frames of the series come before those of
+    `like`; default: none.
     """
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor")
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
-        own = jax.random.fold_in(named_key(key, "frames"), e)
-        clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
+        own, first = jax.random.fold_in(named_key(key, "frames"), e), before[e] if before else 0
+        clean = np.broadcast_to(light_of(model, like, e), (first + frames, *like.shape))
         drawn = sample_by_effect(
             own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key, window=like.window
         )
-        counts.append(np.asarray(drawn))
+        counts.append(np.asarray(drawn)[first:])
     return like.with_counts(counts, like.window)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,13 +27,15 @@ class Portion:
     Attributes:
         frames: the exposures that are used, in memory, with their place on the sensor.
         left_out: sentences on what is not in it.
+        before: for each exposure, how many frames were taken before the first one here; empty: none.
     """
 
     frames: FrameStack
     left_out: tuple[str, ...]
+    before: tuple[int, ...] = ()
 
     @staticmethod
-    def of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> Portion:
+    def of(stack: FrameStack, kinds: tuple[str, ...] = BOTH, before: tuple[int, ...] = ()) -> Portion:
         """The exposures of some kinds, cut to MOST_PIXELS.
 
         Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
@@ -55,7 +57,9 @@ class Portion:
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
         bright = [i for i in range(part.n_exposures) if _is_saturated(part, i)]
-        part = part.select(exposures=[i for i in range(part.n_exposures) if i not in bright]) if bright else part
+        if bright:
+            kept_exposures = [i for i in range(part.n_exposures) if i not in bright]
+            part, chosen = part.select(exposures=kept_exposures), [chosen[i] for i in kept_exposures]
         counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
         check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
         # What depends on the place stays where it is on the sensor.
@@ -70,7 +74,7 @@ class Portion:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):
             left_out.append(f"only the first {per_exposure} frames of each exposure were compared: large capture")
-        return Portion(part.with_counts(counts, window), tuple(left_out))
+        return Portion(part.with_counts(counts, window), tuple(left_out), tuple(before[i] for i in chosen if before))
 
     @cached_property
     def darks(self) -> Portion:
@@ -78,12 +82,13 @@ class Portion:
         dark = [i for i, kind in enumerate(self.frames.kind) if kind == "dark"]
         if len(dark) == self.frames.n_exposures:
             return self
-        return Portion(self.frames.select(exposures=dark), self.left_out)
+        before = tuple(self.before[i] for i in dark if self.before)
+        return Portion(self.frames.select(exposures=dark), self.left_out, before)
 
     def without_flats(self, why: str) -> Portion:
         """Its dark exposures, where flats cannot be compared."""
         darks = self.darks
-        return darks if darks is self else Portion(darks.frames, (*self.left_out, f"flats were not compared: {why}"))
+        return darks if darks is self else replace(darks, left_out=(*self.left_out, f"flats were not compared: {why}"))
 
 
 def _is_saturated(stack: FrameStack, exposure: int) -> bool:

@@ -35,6 +35,10 @@ class Reference:
         deviation = _deviation(draws.var(0, ddof=1), len(draws) - 1, error**2)
         return Reference(names, groups, draws, draws.mean(0), deviation, error**2)
 
+    def of_draws(self, numbers: np.ndarray) -> Reference:
+        """The reference of some of the draws alone."""
+        return Reference.of(self.names, self.groups, self.draws[numbers], np.sqrt(self.floor))
+
     def z(self, values: np.ndarray) -> np.ndarray:
         """(values - mean) / deviation, the error of the mean included."""
         return (values - self.mean) / (self.deviation * np.sqrt(1 + 1 / len(self.draws)))

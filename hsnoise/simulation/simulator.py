@@ -99,7 +99,8 @@ class Simulator:
         return [self.kept[name] for name in names]
 
     def _draw(self, model: NoiseModel, number: int) -> Structure:
-        return self._statistics(draw_capture(jax.random.fold_in(self.key, number), model, self.portion.frames))
+        own = jax.random.fold_in(self.key, number)
+        return self._statistics(draw_capture(own, model, self.portion.frames, self.portion.before))
 
     def _statistics(self, frames: FrameStack) -> Structure:
         return structure(frames, black_level_of(self.model)) if self.measure is None else self.measure(frames)

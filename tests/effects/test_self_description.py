@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import json
 import math
-from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -18,7 +17,6 @@ import hsnoise
 from hsnoise import effects as fx
 from hsnoise.chain.effect_json import effect_from_json, effect_to_json
 from hsnoise.criticism import rules
-from hsnoise.criticism.acceptance import is_there
 from hsnoise.criticism.candidates import built_in, can_be_proposed, facts_of, given, made
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, CaptureFacts, Places
 from hsnoise.likelihood.parameters import IN_LIKELIHOOD
@@ -210,30 +208,11 @@ def test_it_comes_back_from_json(effect):
     assert repr(again) == repr(one) and again.settings() == one.settings()
 
 
-def test_a_value_is_so_far_from_absent():
+def test_an_amplitude_is_scaled_from_where_it_is_absent():
     dof, gain = fx.HeavyTailedReadNoise.specs()["dof"], fx.MissingCodes.specs()["gain"]
-    assert dof.from_absent(20.0, 8.0) == (0.05, 0.02)
-    assert gain.from_absent(1.5) == (0.5, 0.0)
     assert gain.scaled(np.array(1.5), 2.0) == 2.0
     assert dof.scaled(np.array(20.0), 2.0) == 10.0 and dof.scaled(np.array(4.0), 4.0) == 2.05
     assert fx.Crosstalk.specs()["fraction"].scaled(np.array(0.1), 5.0) == 0.25
-
-
-@pytest.mark.parametrize(
-    ("effect", "error", "there"),
-    [
-        (fx.HeavyTailedReadNoise(6.0), 0.5, True),
-        (fx.HeavyTailedReadNoise(60.0), 80.0, False),
-        (fx.MissingCodes(1.5), None, True),  # held: the fit tells no error
-        (fx.MissingCodes(1.0), None, False),
-    ],
-)
-def test_an_effect_is_there_if_it_is_far_from_absent(effect, error, there):
-    (name,) = effect.specs()
-    value = float(getattr(effect, name))
-    rows = {} if error is None else {f"{effect.name}.{name}": (value, error, "1")}
-    result = SimpleNamespace(params=hsnoise.cameras.grasshopper3(), names=tuple(rows), in_dn=lambda _: rows)
-    assert is_there(effect, result) is there
 
 
 class Unmarked(AbstractEffect):

@@ -1,0 +1,88 @@
+"""Tests of the score by which `improve` judges an addition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+import hsnoise.effects as fx
+from hsnoise.criticism.held_out import Judge
+from hsnoise.criticism.outcomes import Improvement
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
+
+BASE = (fx.ShotNoise(), fx.DarkCurrent(20.0), fx.ReadNoise(4.0), fx.Gain(2.0), fx.BlackLevel(64.0), fx.ADC())
+MODEL = hsnoise.NoiseModel(BASE, cfa="mono", shutter="global", exposure_s=0.1)
+ROWS = MODEL.add(fx.RowNoise(1.5))
+DRIFT = MODEL.add(fx.DarkCurrentDrift(4.0))
+
+
+def empty_stack(frames: int, shape: tuple[int, int] = (48, 64)) -> hsnoise.FrameStack:
+    """A stack that only says how a capture is taken."""
+    counts = [np.random.default_rng(i).integers(60, 80, (frames, *shape), np.uint16) for i in range(4)]
+    return hsnoise.FrameStack(counts, (0.02, 0.05, 0.1, 0.2), shutter="global")
+
+
+def capture(model: hsnoise.NoiseModel, frames: int = 8, seed: int = 5):
+    return draw_capture(seed, model, empty_stack(frames))
+
+
+def split(stack, kept: int):
+    return stack.select(frames=slice(kept)), stack.select(frames=slice(kept, None))
+
+
+@pytest.mark.parametrize(("truth", "other"), [(ROWS, MODEL), (MODEL, ROWS)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_true_model_predicts_better(truth, other, seed):
+    judge = Judge.of(*split(capture(truth), 6), seed)
+    gain = judge.improvement(other, truth, 1)
+    assert gain.holds and gain.cost == 0
+    back = judge.improvement(truth, other, 1)
+    assert not back.holds and back.nats == pytest.approx(-gain.nats, abs=1e-6)
+    assert gain.nats == pytest.approx(judge.score(truth) - judge.score(other), abs=1e-6)
+
+
+def test_what_changes_nothing_is_no_better():
+    judge = Judge.of(*split(capture(MODEL), 6), 0)
+    assert not judge.improvement(MODEL, MODEL.add(fx.RowNoise(1e-3)), 1).holds
+    assert judge.improvement(MODEL, MODEL, 0) == Improvement(0.0, 0.0, 0)
+
+
+def test_a_series_goes_on_in_the_frames_held_out():
+    """As if they were the first frames, a drift would not be there."""
+    fitted, held_out = split(capture(DRIFT, 16), 12)
+    judge = Judge.of(fitted, held_out, 0)
+    assert judge.portion.before == (12, 12, 12, 12)
+    assert judge.improvement(MODEL, DRIFT, 1).holds
+    begun_anew = Judge(Portion.of(held_out), True, 0)
+    assert begun_anew.improvement(MODEL, DRIFT, 1).nats < judge.improvement(MODEL, DRIFT, 1).nats - 10
+
+
+def test_later_frames_of_a_series_are_those_of_the_whole():
+    whole = capture(DRIFT, 8)
+    later = draw_capture(5, DRIFT, empty_stack(3), before=(5,) * 4)
+    for some, all_of_them in zip(later.counts, whole.counts, strict=True):
+        np.testing.assert_array_equal(some, all_of_them[5:])
+
+
+def test_frames_that_a_fit_has_seen_cost_a_nat_for_each_number():
+    seen = Judge.of(capture(ROWS), None, 0)
+    assert seen.improvement(MODEL, ROWS, 3).cost == 3 and not seen.unseen
+    assert not Improvement(5.0, 0.1, 3).holds and Improvement(5.0, 0.1, 0).holds
+    assert not Improvement(5.0, 2.0, 0).holds  # within the scatter of its simulation
+
+
+def test_flats_are_judged_beside_the_darks_held_out():
+    lit = hsnoise.FrameStack(
+        [np.random.default_rng(0).poisson(900, (3, 48, 64)).astype(np.uint16)], [0.1], kind="flat", shutter="global"
+    )
+    dark = capture(MODEL)
+    stack = hsnoise.FrameStack.join(lit, dark)
+    fitted, held_out = stack.select(frames=[slice(None), *[slice(6)] * 4]), dark.select(frames=slice(6, None))
+    judge = Judge.of(fitted, held_out, 0)
+    assert judge.portion.frames.kind == ("dark",) * 4 + ("flat",) and judge.portion.before == (6, 6, 6, 6, 0)
+    assert judge.improvement(MODEL, ROWS, 1).cost == 1
+    darks = judge.without_flats
+    assert darks.portion.frames.kind == ("dark",) * 4 and darks.portion.before == (6, 6, 6, 6)
+    assert darks.improvement(MODEL, ROWS, 1).cost == 0
