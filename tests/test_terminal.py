@@ -130,9 +130,9 @@ def test_files_are_there_before_anything_is_said(printed, tmp_path, monkeypatch)
         )
         printed(command, *options)
     assert {"model.json", "table.csv", "histograms.png"} <= there["fit"]
-    assert {"comparison.png", "compare.html"} <= there["compare"]
+    assert {"comparison.png", "residuals.png", "compare.html"} <= there["compare"]
     assert {"ranking.png", "diagnose.html"} <= there["diagnose"]
-    assert {"model.json", "story.txt", "story.png", "improve.html"} <= there["improve"]
+    assert {"model.json", "story.txt", "story.png", "residuals.png", "improve.html"} <= there["improve"]
 
 
 @pytest.mark.parametrize(("light", "colour"), [(Light.GREEN, 32), (Light.AMBER, 33), (Light.RED, 31)])

@@ -40,9 +40,10 @@ from hsnoise.cli.telling import (
 from hsnoise.criticism import Comparison, Story
 from hsnoise.criticism.compare import DRAWS
 from hsnoise.criticism.limit import MOST_STEPS
-from hsnoise.criticism.outcomes import Ended
+from hsnoise.criticism.outcomes import Ended, Verdict
 from hsnoise.fitting.result import Method
 from hsnoise.frames.stack import FrameStack
+from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits
 from hsnoise.simulation.portion import Portion
 
@@ -166,7 +167,8 @@ def _compare(args: argparse.Namespace) -> None:
             f"What is missing: hsnoise diagnose {capture} --model {shlex.quote(args.model)}",
             f"To add it: hsnoise improve {capture} --model {shlex.quote(args.model)}",
         ]
-    _show(args, found, page_of_comparison(found), "comparison.png", stack, fit=model, last=last)
+    off = None if found.fits else model
+    _show(args, found, page_of_comparison(found), "comparison.png", stack, off=off, fit=model, last=last)
 
 
 def _diagnose(args: argparse.Namespace) -> None:
@@ -181,7 +183,8 @@ def _diagnose(args: argparse.Namespace) -> None:
     more: dict[str, Any] = {"fit": fitted}
     if args.report is not None:
         more["comparison"] = _compared(getattr(fitted, "params", fitted), stack, args.seed)
-    _show(args, found, page_of_diagnosis(found), "ranking.png", stack, **more)
+    off = getattr(fitted, "params", fitted) if found.verdict == Verdict.UNEXPLAINED else None
+    _show(args, found, page_of_diagnosis(found), "ranking.png", stack, off=off, **more)
 
 
 def _improve(args: argparse.Namespace) -> int:
@@ -197,7 +200,8 @@ def _improve(args: argparse.Namespace) -> int:
     last = []
     if story.ending.why in (Ended.MINUTES, Ended.STEPS):
         last = [f"To go on: hsnoise improve {same_capture(args)}{_same_story(args, story)} --resume"]
-    _show(args, story, page_of_story(story), "story.png", stack, written=written, last=last)
+    off = None if story.steps[-1].comparison.fits else story.params
+    _show(args, story, page_of_story(story), "story.png", stack, off=off, written=written, last=last)
     return _status(story)
 
 
@@ -230,17 +234,28 @@ def _show(
     figure: str,
     stack: FrameStack,
     *,
+    off: NoiseModel | None = None,
     written: Sequence[str] = (),
     last: Sequence[str] = (),
     **more: Any,
 ) -> None:
-    """Draw the figure of a result, write its report, and print its page; written: other files of it; last: lines."""
-    write_figure(args.out / figure, found.plot())
+    """Draw the figures of a result, write its report, and print its page.
+
+    off: a model from which the frames differ, whose residuals are drawn; written: other files; last: lines of the page.
+    """
+    drawn = [args.out / figure]
+    write_figure(drawn[0], found.plot())
+    if off is not None and max(n for n, kind in zip(stack.n_frames, stack.kind, strict=True) if kind == "dark") > 1:
+        from hsnoise import plots  # matplotlib is slow to import
+
+        drawn.append(args.out / "residuals.png")
+        write_figure(drawn[1], plots.residuals(off, stack, seed=args.seed))
+        last = [f"Where and when the frames differ: {drawn[1]}", *last]
     _write_report(args, found, stack, **more)
     foot = [f"Written to {args.out}/: {', '.join(written)}"] if written else []
     reported = [] if args.report is None else [args.report]
-    foot += [f"Figure: {args.out / figure}", *(f"Report: {one}" for one in reported), *last]
-    _tell(args, page, found, foot, [*(args.out / name for name in (*written, figure)), *reported])
+    foot += [f"Figure: {drawn[0]}", *(f"Report: {one}" for one in reported), *last]
+    _tell(args, page, found, foot, [*(args.out / name for name in written), *drawn, *reported])
 
 
 def _same_story(args: argparse.Namespace, story: Story) -> str:

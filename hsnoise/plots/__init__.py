@@ -12,6 +12,7 @@ from hsnoise.plots._of_fit import of_fit
 from hsnoise.plots._photon_transfer import photon_transfer
 from hsnoise.plots._pixel_map import pixel_map
 from hsnoise.plots._pixel_transfer import pixel_transfer
+from hsnoise.plots._residuals import residuals
 from hsnoise.plots._row_spectrum import row_spectrum
 from hsnoise.plots._sampled import dark_current
 
@@ -25,6 +26,7 @@ __all__ = [
     "pixel_map",
     "pixel_transfer",
     "ranking",
+    "residuals",
     "row_spectrum",
     "story",
 ]

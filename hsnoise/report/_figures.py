@@ -22,9 +22,10 @@ from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.plots._budget import CLEAR, LABELS, ORDER, SHADES
+from hsnoise.plots._residuals import residuals
 from hsnoise.plots._style import NAMES, new_figure, plain_log, tidy
 from hsnoise.report import _measured
-from hsnoise.report._measured import Middle, Shown
+from hsnoise.report._measured import SEED_APART, Middle, Shown
 from hsnoise.report._pictures import pictures
 from hsnoise.statistics.structure import SHORT
 
@@ -73,8 +74,17 @@ def render(
         models=list(models),
         pictures=pictures(near.frames, at.cfa, stack.shape),
         budget=inline(budget_panels(near, list(models)), "b"),
+        residuals=inline(_where(comparison, model, stack, seed), "w"),
         figures=inline(panels(at), "f"),
     )
+
+
+def _where(comparison: Comparison | None, model: NoiseModel, stack: FrameStack, seed: int) -> dict[str, Figure]:
+    """Where and when the frames differ from a model that does not fit; none if it does, or no dark is repeated."""
+    repeated = any(n > 1 for n, kind in zip(stack.n_frames, stack.kind, strict=True) if kind == "dark")
+    if comparison is None or comparison.fits or not repeated:
+        return {}
+    return {"where and when the frames differ from the model": residuals(model, stack, seed=seed + SEED_APART)}
 
 
 def inline(figures: dict[str, Figure], prefix: str) -> list[Markup]:
