@@ -21,6 +21,7 @@ from hsnoise.fitting.result import FitResult
 
 CLEAN = "none"
 TOP = 3
+OTHER_KEY = 1000  # added to the seed of a second run of `improve` on the same capture
 # Clean captures for false alarms: camera, black level DN, rolling, exposures, frames, shape.
 LAYOUTS = (
     ("canon", 0, True, 4, 4, (96, 128)),
@@ -206,8 +207,10 @@ def _improve(cell: Cell, minutes: float, record: dict[str, Any]) -> None:
     stack, truth = cell.make()
     with _timed(record["seconds"], "improve"):
         story = hsnoise.improve(stack, max_minutes=minutes, seed=cell.about["seed"])
+    other = hsnoise.improve(stack, max_minutes=minutes, seed=cell.about["seed"] + OTHER_KEY)
     record["improved"] = {
         "added": [step.added for step in story.steps if step.added],
+        "with_another_key": [step.added for step in other.steps if step.added],
         "ended": story.ending.why,
         "light": story.conclusion.light,
         "error": story.errors[-1],

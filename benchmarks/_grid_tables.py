@@ -30,6 +30,7 @@ def sheets(records: Iterable[dict]) -> list[Sheet]:
         false_alarms([r for r in told if r["effect"] == CLEAN and r["kind"] != "case"]),
         outside([r for r in told if r["kind"] == "grid" and r["effect"] in ODD]),
         pairs([r for r in told if r["kind"] == "grid" and len(hidden_in(r["effect"])) > 1]),
+        complete([r for r in told if "improved" in r]),
         improved([r for r in told if "improved" in r]),
         cases([r for r in told if r["kind"] == "case"]),
         improvement(told),
@@ -149,6 +150,42 @@ def pairs(records: list[dict]) -> Sheet:
         counts = str(sum(map(first_right, group))), str(both), str(len(group))
         sheet.rows.append((*_text(key), _counted(r["verdict"] for r in group), *counts))
     return sheet
+
+
+def complete(records: list[dict]) -> Sheet:
+    """How often `improve` added all that was hidden, and nothing else, by how many were hidden."""
+    headings = (
+        "hidden",
+        "n",
+        "all added",
+        "95 %",
+        "and no other",
+        "others added",
+        "error <= 1.5",
+        "same with another key",
+    )
+    sheet = Sheet("What the whole loop added", headings, left=1)
+    for (kind,), group in grouped(records, lambda r: (_kind(r["effect"]),)).items():
+        added = [(set(hidden_in(r["effect"])), set(r["improved"]["added"])) for r in group]
+        whole = sum(hidden <= found for hidden, found in added)
+        same = sum(r["improved"]["added"] == r["improved"]["with_another_key"] for r in group)
+        low, high = interval(whole, len(group))
+        counts = (whole, f"{low:.0%} to {high:.0%}", sum(hidden == found for hidden, found in added))
+        more = (
+            sum(len(found - hidden) for hidden, found in added),
+            sum(r["improved"]["error"] <= 1.5 for r in group),
+            same,
+        )
+        sheet.rows.append((kind, *map(str, (len(group), *counts, *more))))
+    return sheet
+
+
+def _kind(effect: str) -> str:
+    """What is hidden, by its number; effects that the library lacks apart."""
+    hidden = hidden_in(effect)
+    if any(name in ODD for name in hidden):
+        return "not in the library"
+    return f"{len(hidden)} effect{'' if len(hidden) == 1 else 's'}"
 
 
 def improved(records: list[dict]) -> Sheet:

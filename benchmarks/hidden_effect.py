@@ -1,7 +1,7 @@
 """Is the hidden effect found? Fit, compare, diagnose and refit on a grid of simulated dark captures.
 
     python -m benchmarks.hidden_effect --amplitudes 1,0.5 --seeds 5 --refit
-    python -m benchmarks.hidden_effect --effects odd --pairs --improve 3
+    python -m benchmarks.hidden_effect --effects odd --pairs --triples --improve 5
     python -m benchmarks.hidden_effect --layouts --seeds 10
     python -m benchmarks.hidden_effect --cases FOLDER --refit
     python -m benchmarks.hidden_effect --report-only
@@ -24,7 +24,7 @@ from rich.progress import track
 
 from benchmarks._grid_cells import CLEAN, Cell, case_cells, grid_cells, layout_cells, measure
 from benchmarks._grid_tables import draw_detection, sheets
-from benchmarks.simulator import CAMERAS, MODEST, ODD, PAIRS
+from benchmarks.simulator import CAMERAS, MODEST, ODD, PAIRS, TRIPLES
 
 MOST_MAPS = 50_000  # a Linux process may have 65530 memory maps, and compiled programs use them up
 
@@ -100,7 +100,8 @@ def cells_of(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     if arguments.layouts:
         return layout_cells(seeds)
     groups = {"all": list(MODEST), "none": [CLEAN], "odd": list(ODD)}
-    asked = arguments.effects if arguments.effects is not None else [] if arguments.pairs else ["all", "none"]
+    several = arguments.pairs or arguments.triples
+    asked = arguments.effects if arguments.effects is not None else [] if several else ["all", "none"]
     effects = [name for word in asked for name in groups.get(word, [word])]
     for option, names, known in (
         ("--effects", effects, [*MODEST, *ODD, CLEAN]),
@@ -109,8 +110,7 @@ def cells_of(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
         unknown = [name for name in names if name not in known]
         if unknown:
             parser.error(f"{option}: {', '.join(unknown)} not known; expected {', '.join(known)}")
-    if arguments.pairs:
-        effects += ["+".join(pair) for pair in PAIRS]
+    effects += ["+".join(some) for some in (PAIRS if arguments.pairs else ()) + (TRIPLES if arguments.triples else ())]
     return grid_cells(arguments.cameras, effects, arguments.amplitudes, seeds, arguments.frames, arguments.shape)
 
 
@@ -146,6 +146,7 @@ def main() -> None:
     add("--cameras", type=words, default=["canon", "grasshopper"], help=f"of {', '.join(CAMERAS)}")
     add("--effects", type=words, help="names, all (in the library), odd (not in it), none (clean); default all,none")
     add("--pairs", action="store_true", help="two effects at once, beside those of --effects (default then: none)")
+    add("--triples", action="store_true", help="three effects at once, likewise")
     add("--amplitudes", type=amplitudes, default=[1.0], help="1 is a modest real sensor (default 1)")
     add("--seeds", type=int, default=1, help="captures of each kind (default 1)")
     add("--first-seed", type=int, default=0)
@@ -154,7 +155,7 @@ def main() -> None:
     add("--layouts", action="store_true", help="clean captures of other layouts instead of the grid")
     add("--cases", type=Path, nargs="?", const=folder_of_cases(), help="captures of a folder instead of the grid")
     add("--refit", action="store_true", help="fit again with the effect found, and compare again")
-    add("--improve", type=float, metavar="MINUTES", help="run the whole loop, too, each for so long")
+    add("--improve", type=float, metavar="MINUTES", help="run the whole loop, too, with two keys, each for so long")
     add("--minutes", type=float, help="start no new cell after this time")
     add("--out", type=Path, default=Path("build/hidden_effect.jsonl"), help="where finished cells are kept")
     add("--report-only", action="store_true", help="only tables of the records in --out, nothing is run")

@@ -87,6 +87,13 @@ PAIRS = (
     ("crosstalk", "random_telegraph_noise"),
     ("periodic_banding", "tap_offsets"),
 )
+TRIPLES = (
+    ("row_noise", "hot_pixels", "column_fixed_pattern"),
+    ("frame_offset", "dark_signal_nonuniformity", "crosstalk"),
+    ("periodic_banding", "tap_offsets", "random_telegraph_noise"),
+    ("odd_even_pattern", "cosmic_rays", "black_shading"),
+    ("column_noise", "amplifier_glow", "row_fixed_pattern"),
+)
 
 
 def colour_of(shape: tuple[int, int], channels: int = 3) -> np.ndarray:

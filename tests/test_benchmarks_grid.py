@@ -103,11 +103,13 @@ def records():
     refit = {"refit": True, "error_after": 1.0, "base_after": {"gain.R": [1.1, 0.1]}}
     improved = {
         "added": ["row_noise"],
+        "with_another_key": ["row_noise"],
         "ended": "unexplained",
         "light": "red",
         "error": 9.0,
         "base": {"gain.R": [0.9, 0.05]},
     }
+    pair = {**improved, "added": ["hot_pixels", "crosstalk", "row_noise"], "error": 1.2}
     right, wrong = ("row_noise", 50.0), ("column_noise", 60.0)
     failed = _grid_cells.grid_cells(["canon"], ["crosstalk"], [1.0], [0], 8, (32, 48))[0]
     return [
@@ -117,7 +119,7 @@ def records():
         record("none", "nothing missing", top=[right]),
         record("none", "unexplained", top=[right], seed=1),
         record("ramp_37_rows", "unexplained", top=[right], improved=improved),
-        record("row_noise+hot_pixels", "named", ["hot_pixels"], [("hot_pixels", 90.0), right]),
+        record("row_noise+hot_pixels", "named", ["hot_pixels"], [("hot_pixels", 90.0), right], improved=pair),
         {**failed.about, "refit": False, "seconds": {"simulate": 0.1, "fit": 1.0}, "failure": "ValueError: no"},
     ]
 
@@ -129,7 +131,11 @@ def test_tables_count_what_was_found(records):
     assert tables["False alarms on clean captures"][0][2:7] == ("2", "1", "0", "50.0%", "97.5%")
     assert tables["Two effects at once"][0][3:] == ("named 1", "1", "1", "1")
     whole = ("ramp_37_rows", "canon", "row_noise", "unexplained", "red", "20", "9", "gain.R -10.0% (-2.0)")
-    assert tables["The whole loop"] == [whole]
+    assert tables["The whole loop"][0] == whole
+    assert tables["What the whole loop added"] == [
+        ("2 effects", "1", "1", "3% to 100%", "0", "1", "1", "0"),
+        ("not in the library", "1", "0", "0% to 98%", "0", "1", "0", "1"),
+    ]
     again = {row[0]: row[1:] for row in tables["Error (median) and base parameters"]}
     assert again["row_noise"] == ("3", "1", "20", "1", "0% of 1", "100% of 1")
     assert tables["Cells that raised"][0][1:] == ("fit", "ValueError: no")
