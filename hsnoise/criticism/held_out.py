@@ -17,8 +17,8 @@ from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import structure
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
-DRAWS, LEAST_DRAWS, BATCHES = 96, 48, 4  # of a model that is judged; batches of them tell the error of the simulation
-MOST_DRAWN = 300_000_000  # pixels of the draws of a model
+DRAWS, LEAST_DRAWS, BATCHES = 96, 40, 4  # of a model that is judged; batches of them tell the error of the simulation
+MOST_DRAWN = 60_000_000  # pixels of the draws of a model
 SIDE_DRAWS = 40
 
 
