@@ -212,15 +212,21 @@ class STLSTM(eqx.Module):
                 f" {expected}; make one with init_state"
             )
 
-    def video(self, frames: jax.Array, *, checkpoint: bool = False) -> jax.Array:
-        """All frames [time, batch, row, column, channel], enhanced one after the other from an empty state.
+    def video(self, frames: jax.Array, *, state: State | None = None, checkpoint: bool = False) -> jax.Array:
+        """All frames [time, batch, row, column, channel], enhanced one after the other.
 
-        checkpoint: recompute the inside of each frame for the gradient, which takes a third of the memory.
+        state: from which they go on, such as that of `after`; None: an empty one; checkpoint: recompute the inside of
+        each frame for the gradient, which takes a third of the memory.
         """
         step = jax.checkpoint(_step) if checkpoint else _step
-        state = self.init_state(frames.shape[2:4], frames.shape[1])
+        state = self.init_state(frames.shape[2:4], frames.shape[1]) if state is None else state
         _, out = jax.lax.scan(lambda state, frame: step(self, frame, state), state, frames)
         return out
+
+    def after(self, frames: jax.Array) -> State:
+        """The state after frames [time, batch, row, column, channel] that begin with an empty one."""
+        start = self.init_state(frames.shape[2:4], frames.shape[1])
+        return jax.lax.scan(lambda state, frame: (self(frame, state)[1], None), start, frames)[0]
 
 
 def _step(net: STLSTM, frame: jax.Array, state: State) -> tuple[State, jax.Array]:

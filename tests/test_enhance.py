@@ -64,7 +64,7 @@ def test_a_video_is_enhanced(place, capsys, channels, more):
 def test_without_weights_those_that_come_with_hsnoise_are_taken(place, capsys):
     assert main(["enhance", str(place / "clip.npz"), str(place / "shipped.mp4")]) == 0
     assert (
-        "Using the weights that come with hsnoise, trained for canon_5d3, white of 1.6 to 6.2"
+        "Using the weights that come with hsnoise, trained for canon_5d3, scenes that average 1.6 to 6.2"
         in capsys.readouterr().err
     )
     assert np.stack(list(frames_of(place / "shipped.mp4"))).shape == FRAMES.shape
@@ -140,7 +140,9 @@ def test_nothing_is_left_of_a_run_that_is_terminated(place, monkeypatch):
 
 @pytest.mark.parametrize("dim", [1.0, 0.1])
 def test_video_that_is_far_cleaner_than_in_training_is_told(place, capsys, dim):
-    save_network(place / "dark.eqx", STLSTM(jax.random.key(0), maps=2, kernels=(3,)), {"white_e": [1.5, 6.0]})
+    save_network(
+        place / "dark.eqx", STLSTM(jax.random.key(0), maps=2, kernels=(3,)), {"mean_e": [1.5, 6.0], "unit_e": 6.0}
+    )
     picture = dim * np.linspace(0, 1, 48 * 64 * 3).reshape(48, 64, 3)
     noisy = np.random.default_rng(0).poisson(6 * picture) / 6  # shot noise alone, at the most light that was trained on
     for light, told in ((picture, True), (noisy, False)):

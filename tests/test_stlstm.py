@@ -49,6 +49,8 @@ def test_blocks_are_undone():
 def test_frame_by_frame_is_the_whole_video():
     frames = video(4, (10, 12))
     whole = small_net().video(jnp.asarray(frames))
+    later = small_net().video(jnp.asarray(frames[2:]), state=small_net().after(jnp.asarray(frames[:2])))
+    np.testing.assert_allclose(later, whole[2:], atol=1e-6)
     state = small_net().init_state((10, 12))
     for frame, expected in zip(frames, whole, strict=True):
         out, state = small_net()(jnp.asarray(frame), state)

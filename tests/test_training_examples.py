@@ -17,8 +17,9 @@ from hsnoise.effects import BlackClamp, BlackLevel, DarkCurrent, Gain, ReadNoise
 from hsnoise.enhance.training import evaluate
 from hsnoise.enhance.training.clips import Batch, Clip, crops, held_out, moving_stills, read_clips
 from hsnoise.enhance.training.noisy import camera_of, jittered, matched, noise_of
+from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.scenes import Scene
-from hsnoise.enhance.training.steps import batch_rng, examples
+from hsnoise.enhance.training.steps import Trainer, batch_rng, examples
 from hsnoise.enhance.training.validation import Validation
 from hsnoise.enhance.training.vgg import LAYERS, features_of, name_of, read_weights
 
@@ -28,6 +29,23 @@ def test_a_short_clip_is_played_forth_and_back():
     batch = crops([Clip("short", frames)], batch_rng(0, 0), 64, 7, 8).frames[:, :, 0, 0, 0].astype(int)
     assert set(np.unique(np.abs(np.diff(batch)))) == {1}  # no jump, no frame twice
     assert {0, 3} == set(batch.min(1)) | set(batch.max(1)) and len(np.unique(batch[:, 0])) == 4
+
+
+def test_half_of_the_examples_have_seen_the_frames_before():
+    """Of these the first half has an empty memory: what it has not seen does not change the step."""
+    camera = camera_of("canon_5d3", None, None)
+    trainer = Trainer(Recipe(maps=2, kernels=(3,), warm_up=2), 10, camera, camera.model)
+    rng = np.random.default_rng(0)
+    clean, noisy = (rng.random((2, 5, 8, 8, 3)).astype(np.float32) for _ in range(2))
+
+    def loss_of(change):
+        frames = noisy.copy()
+        change(frames)
+        return float(trainer.learn(trainer.start(0), clean, frames)[1])
+
+    as_it_is = loss_of(lambda frames: None)
+    assert loss_of(lambda frames: frames[0, :2].fill(9.0)) == as_it_is
+    assert loss_of(lambda frames: frames[1, :2].fill(9.0)) != as_it_is
 
 
 @pytest.mark.slow

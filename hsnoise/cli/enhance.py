@@ -99,7 +99,7 @@ def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.n
     noise and picture, so they are never less than the noise.
     """
     for number, frame in enumerate(frames):
-        if number == 0 and (unit_e := _most_unit_e(about)) is not None and _is_clean(frame, unit_e):
+        if number == 0 and "unit_e" in about and _is_clean(frame, about["unit_e"]):
             warnings.warn(
                 f"IN: has far less noise than the weights were trained for, {_light_in_words(about)}; the result may be"
                 " worse than the input",
@@ -108,27 +108,17 @@ def _noted(frames: Iterable[np.ndarray], about: dict[str, Any]) -> Iterator[np.n
         yield frame
 
 
-def _most_unit_e(about: dict[str, Any]) -> float | None:
-    """The most photoelectrons that were 1 in the network's input; None if the weights do not say it.
-
-    The input of some weights was divided by the white of each clip, `white_e`; of others by one constant, `unit_e`.
-    """
-    if "unit_e" in about:
-        return about["unit_e"]
-    return max(about["white_e"]) if "white_e" in about else None
-
-
 def _light_in_words(about: dict[str, Any]) -> str:
-    of, (low, high) = ("scenes that average", about["mean_e"]) if "mean_e" in about else ("white of", about["white_e"])
-    return f"{of} {low:.2g} to {high:.2g} photoelectrons"
+    low, high = about["mean_e"]
+    return f"scenes that average {low:.2g} to {high:.2g} photoelectrons"
 
 
-def _is_clean(frame: np.ndarray, white_e: float) -> bool:
-    """Whether most blocks of light [row, column, channel] lack the shot noise of a 1 of `white_e` electrons."""
+def _is_clean(frame: np.ndarray, unit_e: float) -> bool:
+    """Whether most blocks of light [row, column, channel] lack the shot noise of a 1 of `unit_e` electrons."""
     rows, columns = (n - n % BLOCK for n in frame.shape[:2])
     blocks = frame[:rows, :columns].reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK, -1)
     variance = np.mean(np.diff(blocks, axis=3) ** 2, (1, 3, 4)) / 2
-    clean = variance < CLEAN * blocks.mean((1, 3, 4)) / white_e
+    clean = variance < CLEAN * blocks.mean((1, 3, 4)) / unit_e
     return 2 * np.count_nonzero(clean) > clean.size
 
 
@@ -143,7 +133,7 @@ def _of_display(args: argparse.Namespace, net: STLSTM) -> Iterator[np.ndarray]:
 
 
 def _of_counts(args: argparse.Namespace, camera: NoiseModel, unit_e: float | None) -> Iterator[np.ndarray]:
-    """Light of raw frames in the network's unit; None: white, chosen such that the first frame is ordinarily bright."""
+    """Light of raw frames in the network's unit; None, of weights that state none: the first is ordinarily bright."""
     stack = load(args.video, cfa=args.cfa, kind="flat", exposure_s=args.exposure)
     if stack.n_exposures > 1:  # they are sorted by exposure, not by time
         raise ValueError(f"IN: expected frames of one exposure, got {', '.join(f'{t:g}' for t in stack.exposure_s)} s")

@@ -91,13 +91,10 @@ def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: 
 
 def note_protocol(path: Path, about: dict) -> None:
     """Say under which protocol weights were trained, if it is not that of the scores."""
-    if "protocol" not in about:
+    if about.get("protocol") != PROTOCOL:
         print(
-            f"Note: {path} was trained with white, not the average, of E[N_e], and with the white of each clip as the"
-            f" unit of its input; it is scored by another protocol: {PROTOCOL}"
+            f"Note: {path} was trained by {about.get('protocol', 'an unknown protocol')}, and is scored by {PROTOCOL!r}"
         )
-    elif about["protocol"] != PROTOCOL:
-        print(f"Note: {path} was trained by the protocol {about['protocol']!r}, and is scored by {PROTOCOL!r}")
 
 
 def while_memory_fills(net, scene: Scene) -> dict[str, list[float]]:

@@ -7,7 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Recipe:
-    """Network and optimiser. decay: the learning rate falls to 0 by a cosine, as short runs need; else constant."""
+    """Network and optimiser.
+
+    decay: the learning rate falls to 0 by a cosine, as short runs need; else constant. warm_up: frames that half of the
+    examples have seen before those that are learnt from, so that long videos do not get worse.
+    """
 
     maps: int = 64
     kernels: tuple[int, ...] = (3, 5, 5, 3)
@@ -15,11 +19,12 @@ class Recipe:
     rate: float = 1e-3
     decay: bool = True
     checkpoint: bool = False
+    warm_up: int = 0
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Sizes of a run; recipe: network and optimiser."""
+    """Sizes of a run; frames: that an example is learnt from; recipe: network and optimiser."""
 
     steps: int
     batch: int
@@ -28,10 +33,15 @@ class Preset:
     validate_every: int
     recipe: Recipe
 
+    @property
+    def seen(self) -> int:
+        """Frames of an example, with those before it is learnt from."""
+        return self.frames + self.recipe.warm_up
+
 
 PRESETS = {
     # In so little light, details below 4 pixels are lost: coarse blocks see four times the scene in the same time.
     "smoke": Preset(200, 4, 4, 64, 100, Recipe(maps=8, stride=4, rate=5e-3)),
-    "cpu": Preset(4_400, 4, 12, 64, 500, Recipe(maps=16, stride=4, rate=2e-3)),
+    "cpu": Preset(4_400, 4, 12, 64, 500, Recipe(maps=16, stride=4, rate=2e-3, warm_up=24)),
     "paper": Preset(100_000, 8, 8, 64, 1000, Recipe(maps=64, decay=False)),
 }

@@ -21,7 +21,7 @@ from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, jittered, nois
 from hsnoise.enhance.training.presets import Recipe
 from hsnoise.enhance.training.protocol import unit_of
 from hsnoise.model import NoiseModel
-from hsnoise.stlstm import STLSTM, loss
+from hsnoise.stlstm import STLSTM, State, loss
 
 
 def batch_rng(seed: int, step: int) -> np.random.Generator:
@@ -58,7 +58,7 @@ class Trainer:
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        learn = partial(_learn, self.optimiser, perceptual, recipe.checkpoint)
+        learn = partial(_learn, self.optimiser, perceptual, recipe)
         self._step = eqx.filter_jit(partial(_step, learn, jitter, camera.sensor), donate="none")
         self.learn = eqx.filter_jit(learn, donate="none")
 
@@ -93,16 +93,25 @@ def _step(learn, jitter, sensor, state, batch, key, camera, noise, light):
     return learn(state, *examples(batch, key, camera, noise, light, jitter, sensor))
 
 
-def _learn(optimiser, perceptual, checkpoint, state, clean, noisy):
+def _learn(optimiser, perceptual, recipe, state, clean, noisy):
     net, memory = state
+    before, frames = jnp.split(noisy.swapaxes(0, 1), [recipe.warm_up])
+    start = _half_warm(net, before) if recipe.warm_up else None
 
     def value_of(net: STLSTM) -> jax.Array:
-        enhanced = net.video(noisy.swapaxes(0, 1), checkpoint=checkpoint).swapaxes(0, 1)
-        return loss(enhanced, clean, perceptual)
+        enhanced = net.video(frames, state=start, checkpoint=recipe.checkpoint).swapaxes(0, 1)
+        return loss(enhanced, clean[:, recipe.warm_up :], perceptual)
 
     value, slope = eqx.filter_value_and_grad(value_of)(net)
     change, memory = optimiser.update(slope, memory)
     return (eqx.apply_updates(net, change), memory), value
+
+
+def _half_warm(net: STLSTM, before: jax.Array) -> State:
+    """States of a batch whose later half has seen these frames [time, batch, ...]; those of the others are empty."""
+    cold = before.shape[1] // 2
+    empty = net.init_state(before.shape[2:4], cold)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), empty, net.after(before[:, cold:]))
 
 
 def examples(

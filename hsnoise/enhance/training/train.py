@@ -108,7 +108,7 @@ def loop(trainer, state, first, preset, clips, validation, about, options, conso
     try:
         with ProgressOfTraining(console, preset.steps, first) as progress:
             for step in range(first, preset.steps):
-                batch = crops(clips, batch_rng(options.seed, step), preset.batch, preset.frames, preset.side)
+                batch = crops(clips, batch_rng(options.seed, step), preset.batch, preset.seen, preset.side)
                 at = (step + 1, *trainer.step(at[1], batch, options.seed, step))
                 done, state, value = at
                 last = done == preset.steps
