@@ -29,7 +29,8 @@ def frame_name(stack: Any, exposure: int, number: int) -> str:
     counts = stack.counts[exposure]
     if isinstance(counts, LazyFrames):
         return counts.names[number]
-    return f"counts: frame {number} of {stack.kind[exposure]} exposure {exposure} ({stack.exposure_s[exposure]:g} s)"
+    where = counts.filename if isinstance(counts, np.memmap) else "counts"
+    return f"{where}: frame {number} of {stack.kind[exposure]} exposure {exposure} ({stack.exposure_s[exposure]:g} s)"
 
 
 def in_sensor_orientation(frame: np.ndarray, row_axis: int) -> np.ndarray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,11 +62,23 @@ def read_capture(
             white_level = _shared(some, "white_level") if given is None else given
             levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
             about_levels += about
-            stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
+            with _naming(root if len(read) > 1 else read[0].path):
+                stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
             stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
     joined = FrameStack.join(*stacks)
     return replaced(joined, assumed=(*assumed, *joined.assumed))
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors about frames as a whole name the file, or the folder of several, unless they do."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}") from error
 
 
 def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
@@ -78,7 +91,11 @@ def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[
     console = Console(stderr=True)
     bar = progress and len(paths) >= _LONG_READ and console.is_terminal
     tracked = track(paths, "Reading headers", disable=not bar, transient=True, console=console)
-    return [one for path in tracked for one in reader.read(path)], root, passed + others, reader.EXPOSURE_FROM
+    read = [one for path in tracked for one in reader.read(path)]
+    for one in read:
+        if min(one.counts.shape) < 1:
+            raise ValueError(f"{one.path}: expected frames, got counts of shape {one.counts.shape}")
+    return read, root, passed + others, reader.EXPOSURE_FROM
 
 
 def _with_given(read: list[Recording], exposure_s: Any) -> list[Recording]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import gzip
+import io
+import math
 import warnings
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.io import fits
 
-from hsnoise.frames.io._header import described
-from hsnoise.frames.io._recording import Recording, lazy_frames, naming
+from hsnoise.frames.io._header import check_exposures, described
+from hsnoise.frames.io._recording import LEAST_DECLARED, MOST_PACKED, Recording, check_held, lazy_frames, naming
 
+MOST_COLUMNS = 999
 EXPOSURE_FROM = "EXPTIME, EXPOSURE or EXP_TIME in the FITS header"
 
 
@@ -27,7 +31,9 @@ def read(path: Path) -> list[Recording]:
     """
     with naming(path), warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with fits.open(path, memmap=False) as file:
+        with _opened(path, disable_image_compression=True) as file:
+            _check_tables(file)
+        with _opened(path) as file:
             found = _recording(path, file)
         # Astropy only warns of a file that is cut short, and its frames fail when they are read.
         cut = next((str(one.message) for one in told if "truncated" in str(one.message)), None)
@@ -38,11 +44,38 @@ def read(path: Path) -> list[Recording]:
     return [found]
 
 
+def _opened(path: Path, **options: Any) -> fits.HDUList:
+    if path.suffix.lower() != ".gz":
+        return fits.open(path, memmap=False, **options)
+    state = path.stat()
+    return fits.open(io.BytesIO(_unpacked(path, (state.st_size, state.st_mtime_ns))), **options)
+
+
+@lru_cache(maxsize=1)
+def _unpacked(path: Path, state: tuple[int, int]) -> bytes:
+    """The content of a .gz file, checked to its end; kept, because each frame would have to unpack those before it."""
+    most = max(LEAST_DECLARED, state[0] * MOST_PACKED)
+    with gzip.open(path) as file:
+        content = file.read(most + 1)
+    check_held("the file", state[0], len(content))
+    return content
+
+
+def _check_tables(file: fits.HDUList) -> None:
+    """Raise ValueError for tables of more columns than FITS allows: Astropy would look for each."""
+    for hdu in file:
+        n = hdu.header.get("TFIELDS", 0)
+        if not (isinstance(n, int) and 0 <= n <= MOST_COLUMNS):
+            raise ValueError(f"TFIELDS: expected 0 to {MOST_COLUMNS} columns, got {n!r:.60}")
+
+
 def _recording(path: Path, file: fits.HDUList) -> Recording:
     index = _image_index(file)
     hdu = file[index]
     _check_complete(path, hdu)
     *frames, rows, columns = hdu.shape
+    for one in (file[0].header, hdu.header):
+        check_exposures(one)
     header = file[0].header.copy()
     header.update(hdu.header)
     shape = (frames[0] if frames else 1, (rows, columns))
@@ -51,7 +84,7 @@ def _recording(path: Path, file: fits.HDUList) -> Recording:
 
 
 def _read_frame(path: Path, index: int, *, hdu: int) -> np.ndarray:
-    with fits.open(path, memmap=False) as file:
+    with _opened(path) as file:
         section = file[hdu].section
         return np.asarray(section[index, :, :] if len(section.shape) == 3 else section[:, :])
 
@@ -65,9 +98,11 @@ def _image_index(file: fits.HDUList) -> int:
 
 
 def _check_complete(path: Path, hdu: Any) -> None:
-    if isinstance(hdu, fits.CompImageHDU) or path.suffix.lower() == ".gz":
-        return  # the decompressor notices by itself
-    end, size = hdu.fileinfo()["datLoc"] + hdu.size, path.stat().st_size
+    if isinstance(hdu, fits.CompImageHDU):  # the decompressor notices by itself
+        check_held("the image", path.stat().st_size, math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8)
+        return
+    place = hdu.fileinfo()
+    end, size = place["datLoc"] + hdu.size, place["file"].size
     if end > size:
         raise ValueError(f"truncated: {size} bytes, its header promises {end}")
 

@@ -9,10 +9,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hsnoise.frames.io._recording import Recording, lazy_frames, naming, recordings
+from hsnoise.frames.io._recording import METADATA, Recording, check_held, lazy_frames, naming, recordings
 
-METADATA = ("exposure_s", "kind", "black_level", "white_level", "cfa", "shutter", "iso", "temperature_c")
-LEAST_DECLARED, MOST_PACKED = 1 << 20, 1000  # bytes; noise is hardly packed by a factor of ten
 EXPOSURE_FROM = "'exposure_s' in the HDF5 file"
 
 
@@ -54,9 +52,7 @@ def _data_set(file: h5py.File, name: str = "counts") -> h5py.Dataset:
         raise ValueError(f"the values of {name!r} are in another file, which is not followed; give that file")
     if found.shape is None:
         raise ValueError(f"the data set {name!r} is empty")
-    held, declared = found.id.get_storage_size(), found.size * found.dtype.itemsize
-    if found.size and declared > LEAST_DECLARED and held * MOST_PACKED < declared:
-        raise ValueError(f"{name!r} declares {declared:.3g} bytes and holds {held}: was the file written to its end?")
+    check_held(name, found.id.get_storage_size(), found.size * found.dtype.itemsize)
     return found
 
 

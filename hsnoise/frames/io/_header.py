@@ -48,6 +48,14 @@ def described(header: fits.Header, size: tuple[int, int]) -> dict[str, Any]:
     }
 
 
+def check_exposures(header: fits.Header) -> None:
+    """Raise ValueError for a keyword of the exposure that is given twice, with other values."""
+    for name in EXPOSURE:
+        values = [str(card.value) for card in header.cards if card.keyword == name]
+        if len(set(values)) > 1:
+            raise ValueError(f"{name}: expected one exposure, got {' and '.join(values)}")
+
+
 def _exposure_s(header: fits.Header) -> float | None:
     """The exposure in s, converted if its comment names another unit."""
     for name in EXPOSURE:
@@ -61,12 +69,12 @@ def _exposure_s(header: fits.Header) -> float | None:
 def stated_gain(header: fits.Header) -> StatedGain | None:
     """EGAIN, or a GAIN that may be electrons per DN rather than the number of a setting."""
     electrons = _number(header, ("EGAIN",))
-    if electrons is not None and electrons > 0:
+    if electrons is not None and electrons > 0 and math.isfinite(1 / electrons):
         # Drivers that do not know the gain write 1.
         return StatedGain(1 / electrons, f"EGAIN {electrons:.4g} e-/DN", certain=electrons != 1)
     for name in GAIN:
         value = _number(header, (name,))
-        if value is None or not value > 0:
+        if value is None or not (value > 0 and math.isfinite(1 / value)):
             continue
         says = ELECTRONS_PER_DN.search(header.comments[name]) is not None
         if says or (LEAST_E <= value <= MOST_E and value != 1):
@@ -119,6 +127,8 @@ def _cfa(header: fits.Header) -> str | None:
     pattern = str(header.get("BAYERPAT", "")).strip().upper()
     if not pattern:
         return None
-    if pattern not in BAYER_CFAS or str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP":
+    rows, columns = (_number(header, (name,)) if name in header else 0.0 for name in ("YBAYROFF", "XBAYROFF"))
+    is_bottom_up = str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP"
+    if pattern not in BAYER_CFAS or is_bottom_up or rows is None or columns is None or rows % 1 or columns % 1:
         return UNKNOWN_ORDER
-    return shift_cfa(pattern, int(header.get("YBAYROFF", 0)), int(header.get("XBAYROFF", 0)))
+    return shift_cfa(pattern, int(rows), int(columns))

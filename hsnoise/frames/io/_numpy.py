@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hsnoise.frames.io._recording import Recording, naming, recordings
+from hsnoise.frames.io._recording import METADATA, Recording, check_held, naming, recordings
 
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 EXPOSURE_FROM = "'exposure_s' in an .npz file"
 
 
@@ -30,18 +33,52 @@ def read(path: Path) -> list[Recording]:
             found = np.load(path, mmap_mode="r")
             if not isinstance(found, np.ndarray):
                 raise ValueError("it is an archive of several arrays; give it the suffix .npz")
+            _check_end(found.nbytes, path.stat().st_size - found.offset)
             return recordings(path, _groups(found), {})
         if not zipfile.is_zipfile(path):
             raise ValueError("it is not an .npz file, or it is truncated")
-        with path.open("rb") as file, np.load(file) as arrays:
-            if "counts" not in arrays and path.with_suffix(".json").is_file():
-                return _described(path, arrays)
-            if "counts" not in arrays:
-                raise ValueError(f"expected an array 'counts', got {sorted(arrays)}")
-            return recordings(path, _groups(arrays["counts"]), arrays)
+        with zipfile.ZipFile(path) as archive:
+            names, array = _names(archive), partial(_array, archive)
+            if "counts" not in names and path.with_suffix(".json").is_file():
+                return _described(path, names, array)
+            if "counts" not in names:
+                raise ValueError(f"expected an array 'counts', got {sorted(names)}")
+            return recordings(path, _groups(array("counts")), {name: array(name) for name in METADATA if name in names})
 
 
-def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
+def _names(archive: zipfile.ZipFile) -> list[str]:
+    """Names of the arrays of an .npz file. Raises ValueError if one is given twice or is not what the index says."""
+    for one in archive.infolist():
+        archive.open(one).close()  # compares the name with that beside the data
+    names = [one.removesuffix(".npy") for one in archive.namelist()]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"expected each array once, got several called {twice[0]!r}")
+    return names
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """An array of an .npz file. Raises ValueError if its header declares another size than the file holds."""
+    member = archive.getinfo(f"{name}.npy")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in HEADERS:
+            raise ValueError(f"{name}: expected an array of numbers, got one with names of fields")
+        shape, _, dtype = HEADERS[version](file)
+        declared = math.prod(shape) * dtype.itemsize
+        check_held(name, member.compress_size, declared)
+        if not dtype.hasobject:
+            _check_end(declared, member.file_size - file.tell())
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _check_end(declared: int, held: int) -> None:
+    if held != declared:
+        raise ValueError(f"its header declares {declared} bytes, and it holds {held}")
+
+
+def _described(path: Path, names: list[str], array: Callable[[str], np.ndarray]) -> list[Recording]:
     """Recordings of named arrays, described by the .json file beside them."""
     beside = path.with_suffix(".json")
     about = json.loads(beside.read_text(encoding="utf-8"))
@@ -51,7 +88,7 @@ def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
     found = []
     for name, one in described.items():
         missing = [key for key in ("kind", "exposure_s") if not isinstance(one, dict) or key not in one]
-        if name not in arrays or missing:
+        if name not in names or missing:
             raise ValueError(f"{beside.name} describes {name!r}: expected an array of that name, kind and exposure_s")
         kind = [*str(one["kind"]).split(), ""][0].lower()
         metadata: dict[str, Any] = {"exposure_s": float(one["exposure_s"]), "kind": "dark" if kind == "bias" else kind}
@@ -60,7 +97,7 @@ def _described(path: Path, arrays: Mapping[str, np.ndarray]) -> list[Recording]:
         temperatures = np.asarray(one.get("sensor_temp_c") or [], float)
         if np.isfinite(temperatures).any():
             metadata["temperature_c"] = float(np.nanmean(temperatures))
-        found += recordings(path, _groups(arrays[name]), metadata)
+        found += recordings(path, _groups(array(name)), metadata)
     return found
 
 

@@ -29,6 +29,8 @@ def read(path: Path) -> list[Recording]:
 
 def _read_frame(path: Path, _index: int) -> np.ndarray:
     with Image.open(path) as image:
+        image.verify()  # checksums, which Pillow ignores where pixels are
+    with Image.open(path) as image:
         counts = np.asarray(image)
     with path.open("rb") as file:
         depth = file.read(_DEPTH_AT + 1)[_DEPTH_AT] if counts.dtype == np.uint8 else 8

@@ -11,10 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from hsnoise._core.arguments import one_of
 from hsnoise._core.naming import named
-from hsnoise._core.types import StatedGain
+from hsnoise._core.types import BAYER_CFAS, SHUTTERS, StatedGain
 from hsnoise.frames.lazy import LazyFrames
 
+OF_GROUPS = ("exposure_s", "kind", "temperature_c")  # fields with one value for all exposures or one for each
+METADATA = (*OF_GROUPS, "black_level", "white_level", "cfa", "shutter", "iso")
+CHOICES = {"cfa": ("mono", *BAYER_CFAS), "shutter": SHUTTERS}
+TEXT = ("kind", *CHOICES)
+LEAST_DECLARED, MOST_PACKED = 1 << 20, 1000  # bytes; noise is hardly packed by a factor of ten
 UNKNOWN_ORDER = "unknown order"  # a colour mosaic whose Bayer order the file leaves open
 
 
@@ -90,18 +96,37 @@ def _read_named(path: Path, read: Any, index: int) -> np.ndarray:
         return read(path, index)
 
 
-def _in_seconds(value: Any) -> np.ndarray:
-    """Time spans in any unit as seconds; anything else unchanged."""
-    array = np.asarray(value)
-    return array / np.timedelta64(1, "s") if array.dtype.kind == "m" else array
+def check_held(name: str, held: int, declared: int) -> None:
+    """Raise ValueError for data of which a file declares far more bytes than it holds."""
+    if declared > LEAST_DECLARED and held * MOST_PACKED < declared:
+        raise ValueError(f"{name!r} declares {declared:.3g} bytes and holds {held}: was the file written to its end?")
 
 
 def _values(name: str, value: Any) -> list[Any]:
-    """One value or several of a field. Raises ValueError for text where numbers are expected."""
-    values = np.atleast_1d(_in_seconds(value))
-    if name != "kind" and values.dtype.kind not in "biuf":
-        raise ValueError(f"{named(name)}: expected numbers, got {values.tolist()!r:.60}")
-    return values.tolist()
+    """One value or several of a field; time spans in seconds.
+
+    Raises:
+        ValueError: text where numbers are expected, numbers where text is, or more than one axis.
+    """
+    values = np.asarray(value)
+    if values.dtype.kind == "m":
+        values = values / np.timedelta64(1, "s")
+    expected, kinds = ("text", "US") if name in TEXT else ("numbers", "iuf")
+    if values.dtype.kind not in kinds or values.ndim > 1 or not values.size:
+        raise ValueError(f"{named(name)}: expected {expected}, got {values.tolist()!r:.60}")
+    return values.ravel().tolist()
+
+
+def _shared(name: str, value: Any) -> Any:
+    """The one value of a field of the whole file; black may be a list, one number a channel. ValueError for others."""
+    values = _values(name, value)
+    if len(values) > 1 and name != "black_level":
+        raise ValueError(f"{named(name)}: expected one value, got {values!r:.60}")
+    if name not in TEXT and not np.isfinite(values).all():
+        raise ValueError(f"{named(name)}: expected finite numbers, got {values[0] if len(values) == 1 else values!r}")
+    if name == "iso" and values[0] == 0:  # unknown, as in EXIF
+        return None
+    return one_of(name, values[0], CHOICES[name]) if name in CHOICES else values[0] if len(values) == 1 else values
 
 
 def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> list[Recording]:
@@ -117,20 +142,12 @@ def recordings(path: Path, groups: list[Any], metadata: Mapping[str, Any]) -> li
         ValueError: a field has neither one value nor one per group.
     """
     per_group = {}
-    for name in ("exposure_s", "kind", "temperature_c"):
+    for name in OF_GROUPS:
         values = _values(name, metadata[name]) if name in metadata else [None] * len(groups)
         if len(values) != len(groups) and (len(values) > 1 or name == "exposure_s"):
             raise ValueError(f"{named(name)}: expected {len(groups)} values (one an exposure), got {len(values)}")
         per_group[name] = values * len(groups) if len(values) < len(groups) else values
-    shared = {
-        name: np.asarray(metadata[name]).tolist()
-        for name in ("cfa", "shutter", "black_level", "white_level", "iso")
-        if name in metadata
-    }
-    for name in ("black_level", "white_level", "iso"):
-        numbers = np.asarray(shared.get(name, 0))
-        if numbers.dtype.kind not in "biuf" or not np.isfinite(numbers).all():
-            raise ValueError(f"{named(name)}: expected finite numbers, got {shared[name]!r:.60}")
+    shared = {name: _shared(name, metadata[name]) for name in METADATA if name in metadata and name not in OF_GROUPS}
     return [
         Recording(path=path, counts=counts, **{name: per_group[name][i] for name in per_group}, **shared)
         for i, counts in enumerate(groups)

@@ -11,11 +11,12 @@ import numpy as np
 import tifffile
 
 from hsnoise._core.types import BAYER_CFAS
-from hsnoise.frames.io._recording import UNKNOWN_ORDER, Recording, lazy_frames, naming
+from hsnoise.frames.io._recording import UNKNOWN_ORDER, Recording, check_held, lazy_frames, naming
 from hsnoise.frames.lazy import LazyFrames
 
 EXPOSURE_FROM = "EXIF ExposureTime"
-_CFA_PHOTOMETRIC = 32803
+_CFA_PHOTOMETRIC, _CFA_PATTERN, _UNCOMPRESSED = 32803, 33422, 1
+_HEADER = 8  # bytes
 
 
 def read(path: Path) -> list[Recording]:
@@ -25,13 +26,11 @@ def read(path: Path) -> list[Recording]:
         ValueError: unreadable, truncated, colour pages, pages of several sizes, an invalid exposure or ISO.
     """
     with naming(path), tifffile.TiffFile(path) as file:
-        pages = [page for page in file.pages if not page.is_reduced]  # reduced: a thumbnail
-        sizes = {page.shape for page in pages}
+        pages = _pages(file)
+        sizes = {(page.shape, str(page.dtype)) for page in pages}
         if len(sizes) != 1 or len(pages[0].shape) != 2:
-            raise ValueError(f"expected pages [row, column] of one size, got {sorted(sizes)}")
-        end, size = max(_next_page(file), *map(_end, pages)), path.stat().st_size
-        if end > size:
-            raise ValueError(f"truncated: {size} bytes, its tags promise {end}")
+            raise ValueError(f"expected pages [row, column] of one size and type, got {sorted(sizes)}")
+        _check_segments(pages, _next_page(file), path.stat().st_size)
         first = _tags(pages[0])
         groups: dict[tuple[float | None, float | None], list[int]] = {}
         for page in pages:
@@ -47,6 +46,34 @@ def read(path: Path) -> list[Recording]:
             )
             for (exposure_s, iso), places in groups.items()
         ]
+
+
+def _pages(file: tifffile.TiffFile) -> list[Any]:
+    """All pages but thumbnails. Raises ValueError for pages that lead in a circle."""
+    pages, places = [], set()
+    for page in file.pages:
+        if page.offset in places:
+            raise ValueError("its last page leads back to an earlier one")
+        places.add(page.offset)
+        if not page.is_reduced:
+            pages.append(page)
+    return pages
+
+
+def _check_segments(pages: list[Any], next_page: int, size: int) -> None:
+    """Raise ValueError unless the segments of all pages lie side by side in the file and can hold their pixels."""
+    segments = sorted(pair for page in pages for pair in zip(page.dataoffsets, page.databytecounts, strict=True))
+    end = max(next_page, *(offset + length for offset, length in segments))
+    if end > size:
+        raise ValueError(f"truncated: {size} bytes, its tags promise {end}")
+    ends = [_HEADER, *(offset + length for offset, length in segments)]
+    if any(offset < end for (offset, _), end in zip(segments, ends, strict=False)):
+        raise ValueError("the pixels of its pages overlap")
+    for page in pages:
+        held = sum(page.databytecounts)
+        if page.compression == _UNCOMPRESSED and held < page.nbytes:
+            raise ValueError(f"its tags declare {page.nbytes} bytes of pixels, and it holds {held}")
+        check_held("pixels", held, page.nbytes)
 
 
 def _frames(path: Path, places: list[int], page: Any) -> LazyFrames:
@@ -66,12 +93,6 @@ def _next_page(file: tifffile.TiffFile) -> int:
     return struct.unpack(file.tiff.offsetformat, file.filehandle.read(file.tiff.offsetsize))[0]
 
 
-def _end(page: Any) -> int:
-    """Offset at which the page's last segment ends in the file, bytes."""
-    segments = zip(page.dataoffsets, page.databytecounts, strict=True)
-    return max((offset + length for offset, length in segments), default=0)
-
-
 def _tags(page: Any) -> dict[str, Any]:
     """Tags by name, including those of the EXIF directory."""
     tags = {tag.name: tag.value for tag in page.tags.values()}
@@ -83,9 +104,7 @@ def _exposure_s(tags: dict[str, Any]) -> float | None:
     value = tags.get("ExposureTime")
     if value is None:
         return None
-    if not isinstance(value, tuple):
-        return float(value)
-    if len(value) != 2 or not value[1]:
+    if not isinstance(value, tuple) or len(value) != 2 or not value[1]:
         raise ValueError(f"ExposureTime: expected one rational number of seconds, got {value}")
     return float(value[0] / value[1])
 
@@ -101,7 +120,7 @@ def _iso(tags: dict[str, Any]) -> float | None:
 
 
 def _cfa(page: Any, tags: dict[str, Any]) -> str | None:
-    if page.photometric != _CFA_PHOTOMETRIC:
+    if page.photometric != _CFA_PHOTOMETRIC and _CFA_PATTERN not in page.tags:
         return None
     pattern = tags.get("CFAPattern", ())
     codes = pattern if isinstance(pattern, bytes | tuple) else ()

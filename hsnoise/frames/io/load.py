@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hsnoise._core.arguments import one_of
+from hsnoise._core.types import BAYER_CFAS, SHUTTERS
 from hsnoise.frames.io._capture import read_capture
 from hsnoise.frames.stack import FrameStack
 
@@ -58,6 +59,10 @@ def load(
         ValueError: an unreadable file, no exposure time, or frames that do not belong together without a majority;
             the message names the file. Also all errors of `FrameStack`.
     """
+    if cfa is not None:
+        one_of("cfa", cfa, ("mono", *BAYER_CFAS))
+    if shutter is not None:
+        one_of("shutter", shutter, SHUTTERS)
     options = {"cfa": cfa, "black_level": black_level, "white_level": white_level, "shutter": shutter}
     return read_capture(
         path,
