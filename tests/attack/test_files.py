@@ -1,4 +1,4 @@
-"""Files with one thing broken: read as the clean ones, refused by name, or told; never a crash, hang or wrong number."""
+"""Files with one thing broken: read as clean ones, refused by name, or told; never a crash, hang or wrong number."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     python worker.py FIRST END
 
-It prints the number of a case before it begins. A case that takes too long ends the process: a signal that no library
-holds up.
+After the table come more cases of those that are drawn at random. The number of a case is printed before it begins. A
+case that takes too long ends the process: a signal that no library holds up.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from breaks import Case, cases
+from breaks import cases
 from captures import CLEAN, GIVEN
+from case import Case
 
 import hsnoise
 
@@ -68,6 +69,7 @@ def outcome(case: Case, number: int, clean: tuple[dict[str, Any], set[str]], fol
 
 def main(first: int, end: int) -> None:
     table = cases()
+    drawn = [case for case in table if case.drawn]
     root = Path(tempfile.mkdtemp())
     clean = {}
     for format, (write, _) in CLEAN.items():
@@ -77,7 +79,7 @@ def main(first: int, end: int) -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES,) * 2)
     for number in range(first, end):
-        case = table[number % len(table)]
+        case = table[number] if number < len(table) else drawn[number % len(drawn)]
         print(json.dumps({"begins": number, "case": f"{case.format}: {case.name}"}), flush=True)
         folder = root / "broken"
         folder.mkdir()
