@@ -26,7 +26,7 @@ from hsnoise._core.poisson import Regime, regime_of
 from hsnoise._core.types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
 from hsnoise.chain.arguments import checked_exposure, checked_light, piece_of
 from hsnoise.chain.arrivals import merged
-from hsnoise.chain.effect_json import arrays_of, effect_from_json, effect_to_json
+from hsnoise.chain.effect_json import arrays_of, check_all_taken, effect_from_json, effect_to_json
 from hsnoise.chain.model_file import read_model, write_model
 from hsnoise.chain.signals import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
@@ -205,10 +205,9 @@ class NoiseModel(eqx.Module):
         try:
             with jax.enable_x64(content["precision"] == "float64"):
                 channels = channels_of(content["cfa"])
-                return NoiseModel(
-                    [effect_from_json(item, classes, channels, arrays) for item in content["effects"]],
-                    **{field: content[field] for field in ("cfa", "shutter", "exposure_s")},
-                )
+                found = [effect_from_json(item, classes, channels, arrays) for item in content["effects"]]
+                check_all_taken(found, arrays)
+                return NoiseModel(found, **{field: content[field] for field in ("cfa", "shutter", "exposure_s")})
         except KeyError as error:
             raise ValueError(f"{path}: {error} is missing.") from error
         except (AttributeError, TypeError, ValueError) as error:

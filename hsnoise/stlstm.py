@@ -24,6 +24,7 @@ from hsnoise._core.types import RandomKey
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 FORGET_BIAS = 1.0
+MOST_LAYERS = 64  # the paper has 4; a file that declares thousands would keep a reader busy for hours
 REACH = 16  # blocks beyond a tile that the network sees
 L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equation 10
 
@@ -162,7 +163,9 @@ class STLSTM(eqx.Module):
         for name, value in {"maps": maps, "stride": stride, "channels": channels}.items():
             whole_number(name, value, 1)
         kernels = listed("kernels", kernels, "odd sizes, one per layer")
-        if not kernels or any(whole_number("kernels", kernel, 1) % 2 == 0 for kernel in kernels):
+        if not 0 < len(kernels) <= MOST_LAYERS:
+            raise ValueError(f"kernels: expected 1 to {MOST_LAYERS} sizes, one per layer, got {len(kernels)}")
+        if any(whole_number("kernels", kernel, 1) % 2 == 0 for kernel in kernels):
             raise ValueError(f"kernels: expected odd sizes, one per layer, got {kernels}")
         first, last, *rest = jax.random.split(key, 2 + len(kernels))
         self.features = Convolution(first, 3, channels * stride**2, maps)

@@ -46,7 +46,9 @@ def whole_number(name: str, value: Any, least: int | None = None) -> int:
     try:
         number = operator.index(value)
     except TypeError:
-        raise TypeError(f"{named(name)}: expected a whole number, got {value!r}") from None
+        number = None
+    if number is None or isinstance(value, bool):
+        raise TypeError(f"{named(name)}: expected a whole number, got {value!r}")
     if least is not None and number < least:
         raise ValueError(f"{named(name)}: expected at least {least}, got {value}")
     return number

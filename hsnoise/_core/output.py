@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.interrupting import unfinished
+from hsnoise._core.naming import named
 
 FRAME_FORMATS = (".npz", ".npy", ".tif", ".tiff", ".fits")
 _EXPOSURE_TIME_TAG, _RATIONAL = 33434, 5
-MOST_DENOMINATOR = 2**32 - 1  # of a rational number in a tag
+MOST_PART = 2**32 - 1  # above and below the line of a rational number in a tag
+SAME_EXPOSURE = 1e-3  # exposures that differ by less count as the same when they are read
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:
@@ -43,6 +45,14 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
             raise type(error)(error.errno, error.strerror, str(path)) from error  # not of the temporary file
 
 
+def check_file(name: str, path: Path, made: str | os.PathLike | None = None) -> None:
+    """Raise ValueError, naming the argument, unless `path` may be a file in a folder that exists or is `made` later."""
+    if path.is_dir():
+        raise ValueError(f"{named(name)}: expected a file, but {path} is a folder")
+    if not path.parent.is_dir() and (made is None or path.parent.resolve() != Path(made).resolve()):
+        raise ValueError(f"{named(name)}: there is no folder {path.parent}")
+
+
 def write_figure(path: str | os.PathLike, figure: Any, **keywords: Any) -> None:
     """Write a Matplotlib figure as PNG, all or nothing; `keywords` go to `savefig`."""
     buffer = io.BytesIO()
@@ -60,7 +70,7 @@ def frames_file(suffix: str, counts: np.ndarray, metadata: Mapping[str, Any]) ->
         metadata: exposure_s [exposure], kind, cfa, and any other field that `hsnoise.load` reads from an .npz file.
 
     Raises:
-        ValueError: an unknown suffix, or a format that cannot hold several exposures.
+        ValueError: an unknown suffix, or a format that cannot hold the exposures.
     """
     if suffix not in FRAME_FORMATS:
         raise ValueError(
@@ -95,7 +105,10 @@ def _write_fits(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, A
 def _write_tiff(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, Any]) -> None:
     import tifffile
 
-    exposure_s = Fraction(float(metadata["exposure_s"][0])).limit_denominator(MOST_DENOMINATOR)
+    seconds = float(metadata["exposure_s"][0])
+    exposure_s = Fraction(seconds).limit_denominator(MOST_PART)
+    if exposure_s.numerator > MOST_PART or abs(exposure_s - Fraction(seconds)) > SAME_EXPOSURE * seconds:
+        raise ValueError(f"a .tif file cannot hold an exposure of {seconds:g} s; write an .npz or a .fits file")
     tag = (_EXPOSURE_TIME_TAG, _RATIONAL, 1, exposure_s.as_integer_ratio(), True)
     with tifffile.TiffWriter(buffer) as file:
         for frame in frames:
@@ -133,6 +146,8 @@ def read_image(path: str | os.PathLike) -> np.ndarray:
             image = np.asarray(file)
     else:
         raise ValueError(f"{path}: unknown image format; known are .npy, .tif, .tiff and .png")
+    if image.dtype.kind not in "biuf":
+        raise ValueError(f"{path}: expected an image of real numbers, got {image.dtype}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise ValueError(f"{path}: expected an image [row, column] or [row, column, 3], got shape {image.shape}")
     return image

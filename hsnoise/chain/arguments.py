@@ -56,9 +56,11 @@ def _as_float(value) -> float:
 
 
 def checked_exposure(exposure_s):
-    """The exposure in seconds, checked to be one number >= 0."""
+    """The exposure in seconds, checked to be one number >= 0 that float32 can hold."""
     if np.ndim(exposure_s) != 0:
         raise ValueError(f"{named('exposure_s')}: expected one number of seconds, got shape {np.shape(exposure_s)}.")
-    if not is_traced(exposure_s) and not 0 <= _as_float(exposure_s) < np.inf:
+    if isinstance(exposure_s, bool | str):
+        raise TypeError(f"{named('exposure_s')}: expected a number of seconds, got {exposure_s!r:.60}.")
+    if not is_traced(exposure_s) and not 0 <= _as_float(exposure_s) <= float(np.finfo(np.float32).max):
         raise ValueError(f"{named('exposure_s')}: expected finite seconds >= 0, got {exposure_s!s:.60}.")
     return exposure_s

@@ -35,6 +35,13 @@ def arrays_of(effects: Iterable[AbstractEffect]) -> dict[str, np.ndarray]:
     }
 
 
+def check_all_taken(effects: Iterable[AbstractEffect], arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError if a file holds measured arrays that no effect takes."""
+    left = sorted(set(arrays) - set(arrays_of(effects)))
+    if left:
+        raise ValueError(f"arrays: no effect takes {', '.join(left)}.")
+
+
 def effect_from_json(
     item: Mapping,
     classes: Mapping[str, type[AbstractEffect]],
@@ -56,7 +63,7 @@ def effect_from_json(
         value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")
-        values[field] = np.array([value[channel] for channel in channels]) if spec.per_channel else value
+        values[field] = [value[channel] for channel in channels] if spec.per_channel else value
     return classes[name](**values, **_measured(item, classes[name], arrays or {}), **item["settings"])
 
 

@@ -87,8 +87,8 @@ def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _arrays(path: Path, stated: Any) -> dict[str, np.ndarray]:
     if not (isinstance(stated, dict) and all(isinstance(stated.get(key), str) for key in ("file", "sha256"))):
         raise ValueError(f'{path}: arrays: expected {{"file": ..., "sha256": ...}}, two texts, got {stated!r:.80}.')
-    beside = path.with_name(Path(stated["file"]).name)
-    if not beside.exists():
+    beside = path.parent / Path(stated["file"]).name
+    if not beside.is_file():
         raise ValueError(f"{path}: its measured arrays are in {beside.name}, which is not beside it; copy both files.")
     found = beside.read_bytes()
     if hashlib.sha256(found).hexdigest() != stated["sha256"]:

@@ -46,6 +46,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits
 from hsnoise.simulation.portion import Portion
+from hsnoise.statistics.pixels.maps import check_path
 
 MEANING = """\
 One electron adds `gain` DN to a count. A pixel collects `dark_current.rate` electrons per second without light, and \
@@ -138,6 +139,9 @@ def _inspect(args: argparse.Namespace) -> int:
 
 def _fit(args: argparse.Namespace) -> int:
     check_folder(args.out)
+    if args.maps is not None:
+        with as_options({"path": "--maps"}):
+            check_path(args.maps, made=args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
     args.out.mkdir(parents=True, exist_ok=True)  # fail before the long work
     fit = fit_with_progress(stack, args.method, model, args.pixels)

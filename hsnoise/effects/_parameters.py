@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+MOST_LINES = 65536  # rows or columns of the largest sensors
 LARGEST_UINT32 = float(np.nextafter(np.float32(2**32), np.float32(0)))  # largest that float32 can hold, too
 
 
@@ -51,6 +52,11 @@ class Parameter:
     spec: ParameterSpec
 
 
+def is_whole(value: Any, low: int, high: int) -> bool:
+    """Whether a setting is a whole number within these bounds; True and False are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
+
+
 def check_white_level(name: str, value: Any) -> None:
     """Raise ValueError unless a largest count is None or a whole number that counts can hold."""
     is_number = isinstance(value, Real) and not isinstance(value, bool)
@@ -58,9 +64,19 @@ def check_white_level(name: str, value: Any) -> None:
         raise ValueError(f"{name}: expected a positive whole number or None, got {value!r:.60}.")
 
 
+def _holds_numbers(x: Any) -> bool:
+    """Whether `x` is a number, an array or a list of them; text and truth values, which convert to some, are none."""
+    if isinstance(x, list | tuple):
+        return all(map(_holds_numbers, x))
+    dtype = getattr(x, "dtype", None)
+    return isinstance(x, Real) and not isinstance(x, bool) if dtype is None else np.dtype(dtype).kind in "iuf"
+
+
 def _as_leaf(x):
     # An array keeps its own precision: a fit hands over float64 whatever the session uses.
     if eqx.is_inexact_array(x) and isinstance(x, jax.Array):
+        return x
+    if not _holds_numbers(x):
         return x
     try:
         return jnp.asarray(x, float)

@@ -13,7 +13,7 @@ import numpy as np
 
 from hsnoise._core.types import Frames, PixelMap, RandomKey, cfa_tile
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
-from hsnoise.effects._parameters import measured
+from hsnoise.effects._parameters import MOST_LINES, is_whole, measured
 
 NORMALISED = 1e-3  # relative deviation of a mean or mean square from 1 that is rounding
 SCALES = {"dark_current": np.mean, "read_noise": lambda x: np.mean(x**2)}
@@ -72,7 +72,7 @@ class MeasuredMap(AbstractEffect):
     first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=_pair)
 
     def check_arrays(self) -> None:
-        if len(self.first) != 2 or any(not isinstance(i, int | np.integer) or i < 0 for i in self.first):
+        if len(self.first) != 2 or not all(is_whole(i, 0, MOST_LINES) for i in self.first):
             raise ValueError(f"measured_map.first: expected a row and a column of the sensor, got {self.first!r:.60}.")
         shapes = {value.shape for value in self.arrays().values()}
         if len(shapes) > 1:

@@ -12,7 +12,7 @@ import numpy as np
 from hsnoise._core.types import Frames, RandomKey, Scalar, cfa_tile
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
-from hsnoise.effects._parameters import param
+from hsnoise.effects._parameters import MOST_LINES, is_whole, param
 
 TINY = 1e-12  # a shared part whose root has a derivative
 
@@ -51,11 +51,17 @@ class RowGroupNoise(AbstractEffect):
     after_gain: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        for field, low, high in (("rows", 2, None), ("start", 0, "rows"), ("row_banks", 1, 2), ("column_banks", 1, 2)):
-            value, most = getattr(self, field), self.rows - 1 if high == "rows" else high
-            if not isinstance(value, int) or value < low or (most is not None and value > most):
-                expected = f"at least {low}" if most is None else f"from {low} to {most}"
-                raise ValueError(f"row_group_noise.{field}: expected a whole number {expected}, got {value!r}.")
+        bounds = {"rows": (2, MOST_LINES), "row_banks": (1, 2), "column_banks": (1, 2)}
+        for field, (low, high) in bounds.items():
+            self._check(field, low, high)
+        self._check("start", 0, self.rows - 1)
+
+    def _check(self, field: str, low: int, high: int) -> None:
+        value = getattr(self, field)
+        if not is_whole(value, low, high):
+            raise ValueError(
+                f"row_group_noise.{field}: expected a whole number from {low} to {high}, got {value!r:.60}."
+            )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         groups, banks = capture.sensor_shape[0] // self.rows + 2, self.row_banks * self.column_banks

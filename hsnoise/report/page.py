@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hsnoise._core.naming import named
-from hsnoise._core.output import write_atomically
+from hsnoise._core.output import check_file, write_atomically
 from hsnoise.criticism import Comparison, Diagnosis, Story
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
@@ -31,10 +31,7 @@ def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None
     path = Path(path)
     if path.suffix.lower() != ".html":
         raise ValueError(f"{named('report')}: expected a file ending in .html, got {path}")
-    if path.is_dir():
-        raise ValueError(f"{named('report')}: expected a file, but {path} is a folder")
-    if not path.parent.is_dir() and (made is None or path.parent.resolve() != Path(made).resolve()):
-        raise ValueError(f"{named('report')}: there is no folder {path.parent}")
+    check_file("report", path, made)
 
 
 def page(

@@ -154,8 +154,8 @@ def run(options: argparse.Namespace) -> None:
     """
     if options.crop < LEAST_CROP:
         raise ValueError(f"--crop: expected at least {LEAST_CROP} pixels, as SSIM needs, got {options.crop}")
-    options.out.mkdir(parents=True, exist_ok=True)
     network, about = load_network(options.weights)
+    options.out.mkdir(parents=True, exist_ok=True)
     camera = camera_for(about, options)
     split = split_of(read_clips(options.clips), options.split)
     check_sizes(sum(split, []), LEAST_FRAMES, LEAST_CROP)

@@ -9,13 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from hsnoise._core.output import write_atomically
+from hsnoise._core.naming import named
+from hsnoise._core.output import check_file, write_atomically
 from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.pixels.classes import slope_over
 from hsnoise.statistics.pixels.flags import FLAGS, flags_of
 from hsnoise.statistics.pixels.sample import MOST_COUNTS, MOST_OF_ALL, MOST_PIXELS
 from hsnoise.statistics.pixels.survey import Survey, survey
+
+MAP_FORMATS = (".npz", ".fits")
+
+
+def check_path(path: str | os.PathLike, *, made: str | os.PathLike | None = None) -> None:
+    """Raise ValueError unless maps can be written to `path`, in a folder that exists or is `made` later."""
+    path = Path(path)
+    if path.suffix.lower() not in MAP_FORMATS:
+        raise ValueError(f"{named('path')}: expected a file ending in {' or '.join(MAP_FORMATS)}, got {path}")
+    check_file("path", path, made)
 
 
 @dataclass(frozen=True)
@@ -40,9 +51,8 @@ class PixelMaps:
 
         Raises ValueError for any other suffix.
         """
+        check_path(path)
         suffix = Path(path).suffix.lower()
-        if suffix not in (".npz", ".fits"):
-            raise ValueError(f"path: expected a file ending in .npz or .fits, got {path}")
         buffer = io.BytesIO()
         if suffix == ".npz":
             np.savez_compressed(buffer, **self._arrays(), dark_current_unit=self.dark_current_unit)
