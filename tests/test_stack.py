@@ -223,6 +223,25 @@ def test_counts_that_wrapped_below_zero_are_refused(kind, level, rng):
         FrameStack(counts, 1.0)
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_counts_that_wrapped_in_fewer_bits_are_refused(bits, rng):
+    counts = np.round(3 * rng.standard_normal((4, 64, 96))).astype(np.int32) % 2**bits
+    with pytest.raises(ValueError, match=f"of the counts lie just below {2**bits} and the others near 0"):
+        FrameStack(counts.astype(np.uint16), 1.0)
+
+
+def test_bright_flats_with_dark_columns_have_not_wrapped(rng):
+    counts = np.round(3900 + 30 * rng.standard_normal((4, 64, 96))).astype(np.uint16)
+    counts[:, :, :2] = rng.integers(0, 3, (4, 64, 2))
+    FrameStack(counts, 1.0, kind="flat")
+
+
+def test_dark_frames_of_a_clamped_black_with_columns_that_saturate_have_not_wrapped(rng):
+    counts = np.maximum(np.round(3 * rng.standard_normal((4, 64, 96))), 0).astype(np.uint16)
+    counts[:, :, :2] = 4000
+    FrameStack(counts, 1.0)
+
+
 @pytest.mark.parametrize("hot", [65535, 64000])
 def test_hot_pixels_that_saturate_have_not_wrapped(hot, rng):
     counts = np.round(100 + 3 * rng.standard_normal((4, 64, 96))).astype(np.uint16)

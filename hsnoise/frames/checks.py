@@ -11,6 +11,8 @@ from hsnoise._core.types import channels_of
 from hsnoise.frames.bayer import channel_pixels
 
 WRAPPED = 1e-3  # share of the counts
+DEPTHS = (8, 10, 12, 14, 16)  # bits of a count
+LIGHT = 0.75  # share of a frame that no subtraction makes negative
 STARTS, BETWEEN = 2, 0.1  # DN; share of those that wrapped
 
 
@@ -41,9 +43,10 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
         )
     if high > np.iinfo(np.int32).max:
         raise ValueError(f"{name}: counts must fit in 31 bits, got {high:g}")
-    if frame.dtype.kind == "u" and (share := wrapped_share(frame, high)) > WRAPPED:
+    end = next((2**bits for bits in DEPTHS if high < 2**bits), 2**32)
+    if (share := wrapped_share(frame, high, end)) > WRAPPED:
         raise ValueError(
-            f"{name}: {share:.1%} of the counts lie just below {np.iinfo(frame.dtype).max + 1} and the others near 0: "
+            f"{name}: {share:.1%} of the counts lie just below {end} and the others near 0: "
             "counts below 0 wrapped around, as where a dark is subtracted from unsigned counts; give the raw frames"
         )
     if low == high:
@@ -58,18 +61,18 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
             )
 
 
-def wrapped_share(frame: np.ndarray, highest: int) -> float:
-    """Share of unsigned counts that were below 0 and have wrapped around: far above, next to the type's end.
+def wrapped_share(frame: np.ndarray, highest: int, end: int) -> float:
+    """Share of counts that were below 0 and have wrapped around: far above, just below `end`.
 
-    The others must begin at 0, and next to none lie between; pixels that saturate at the end itself are none of them.
+    The others must begin at 0, and next to none lie between; pixels that saturate at the highest count are none of
+    them, and neither are most pixels of a frame: those are light.
     """
-    end = np.iinfo(frame.dtype).max
     if highest < end - end // 8:
         return 0.0
     values = _thin(frame.ravel())
-    above, below = values > end - end // 8, values < end // 8
-    share, between = float(np.mean(above & (values < end))), 1.0 - float(np.mean(above | below))
-    continues = below.any() and int(values[below].min()) <= STARTS
+    above, below = values >= end - end // 8, values < end // 8
+    share, between = float(np.mean(above & (values < highest))), 1.0 - float(np.mean(above | below))
+    continues = share < LIGHT and below.any() and int(values[below].min()) <= STARTS
     return float(above.mean()) if continues and between < BETWEEN * share else 0.0
 
 
