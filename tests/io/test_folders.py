@@ -229,3 +229,15 @@ def test_folders_of_real_sensors(shared_data):
     twilight = load(shared_data / "data" / "ccd_kaf_mit")
     assert twilight.n_frames == (20, *[1] * 17)
     assert load(shared_data / "data" / "emva1288" / "001_CCD_12Bit").white_level == 4095
+
+
+def test_masters_alone_are_refused_if_their_headers_say_so(tmp_path):
+    write_some(tmp_path / "darks", EXPTIME=1.0, NCOMBINE=7)
+    with pytest.raises(ValueError, match="no dark and no flat frames: 3 frames .* averages of several frames"):
+        load(tmp_path / "darks")
+
+
+def test_masters_alone_by_their_names_are_told(tmp_path):
+    for i in range(2):
+        write(tmp_path / f"masterdark{i}.fits", seed=i, EXPTIME=1.0)
+    assert "2 frames called master: are they averages? These have less noise than frames" in load(tmp_path).assumed

@@ -53,6 +53,8 @@ def sort_out(read: Sequence[Recording], root: Path) -> Sorted:
             raise ValueError(
                 f"{named('path')}: no dark and no flat frames: {'; '.join(told)}; give {setting('kind')} if they are"
             )
+    n = sum(r.n_frames for r in kept if _is_called_master(r, root))
+    told += [f"{frames(n)} called master: are they averages? These have less noise than frames"] if n else []
     size = _main_size(kept)
     return Sorted([r for r in kept if r.size == size], [r for r in kept if r.size != size], told)
 
@@ -75,11 +77,16 @@ def _lights(read: list[Recording]) -> Reasons:
 def _masters(read: list[Recording], root: Path) -> Reasons:
     why = "", "averages of several frames (masters) have less noise than frames"
     masters = [i for i, r in enumerate(read) if _is_master(r, root)]
-    return dict.fromkeys(masters, why) if len(masters) < len(read) else {}
+    # Names alone do not condemn a whole capture: its folder may be called anything.
+    return dict.fromkeys(masters, why) if len(masters) < len(read) or all(r.is_master for r in read) else {}
+
+
+def _is_called_master(recording: Recording, root: Path) -> bool:
+    return any("master" in name.lower() for name in names_of(recording.path, root))
 
 
 def _is_master(recording: Recording, root: Path) -> bool:
-    if recording.is_master or any("master" in name.lower() for name in names_of(recording.path, root)):
+    if recording.is_master or _is_called_master(recording, root):
         return True
     if np.dtype(recording.counts.dtype).kind != "f":
         return False
