@@ -115,37 +115,39 @@ def _write_tiff(buffer: io.BytesIO, frames: np.ndarray, metadata: Mapping[str, A
             file.write(frame, photometric="minisblack", metadata=None, extratags=[tag])
 
 
-def _array(path: Path) -> Any:
-    try:
-        return np.load(path)
-    except ValueError as error:  # pickled objects, which are not loaded, or a broken file
-        raise ValueError(f"{path}: cannot be read as an array of numbers: {error}") from error
+def _image(path: Path) -> Any:
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        with path.open("rb") as file:  # NumPy leaves it open if it is broken
+            return np.load(file)
+    if suffix in (".tif", ".tiff"):
+        import tifffile
+
+        return tifffile.imread(path)
+    if suffix == ".png":
+        from PIL import Image
+
+        with Image.open(path) as file:
+            return np.asarray(file)
+    raise ValueError("unknown image format; known are .npy, .tif, .tiff and .png")
 
 
 def read_image(path: str | os.PathLike) -> np.ndarray:
     """An image of light, `[row, column]` or `[row, column, 3]` in R, G, B, from .npy, .tif or .png.
 
     Raises:
-        ValueError: an unknown format, or an array of another shape.
+        ValueError: an unknown format, a broken file, or an array of another shape.
         OSError: no such file.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
-        image = _array(path)
-        if not isinstance(image, np.ndarray):
-            raise ValueError(f"{path}: expected one array, got an archive of several (.npz)")
-    elif suffix in (".tif", ".tiff"):
-        import tifffile
-
-        image = tifffile.imread(path)
-    elif suffix == ".png":
-        from PIL import Image
-
-        with Image.open(path) as file:
-            image = np.asarray(file)
-    else:
-        raise ValueError(f"{path}: unknown image format; known are .npy, .tif, .tiff and .png")
+    try:
+        image = _image(path)
+    except Exception as error:  # each library has its own for a broken file
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise ValueError(f"{path}: cannot be read as an image: {error or type(error).__name__}") from error
+    if not isinstance(image, np.ndarray):
+        raise ValueError(f"{path}: expected one array, got an archive of several (.npz)")
     if image.dtype.kind not in "biuf":
         raise ValueError(f"{path}: expected an image of real numbers, got {image.dtype}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):

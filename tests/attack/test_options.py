@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import shlex
+import struct
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import hsnoise
 from hsnoise.cli.main import main
@@ -38,6 +40,7 @@ OF_SAMPLES = """
 --mean-e nan --clean clean.npy | --mean-e inf --clean clean.npy | --mean-e -1 --clean clean.npy | --mean-e 5
 --mean-e 5 --clean zero.npy | --clean nan.npy | --clean negative.npy | --clean odd.npy | --clean text.npy
 --clean complex.npy | --clean archive.npy | --clean objects.npy | --clean one.npy | --clean nowhere.npy
+--clean cut.png | --clean cut.npy | --clean cut-archive.npy | --clean no-bytes.npy | --clean large.png
 --clean broken.png | --clean broken.tif | --clean empty | --clean loop | --clean file.txt
 --out empty | --out folder.npz | --out file.txt/x.npz | --out nowhere/x.npz | --out /dev/full
 --out x.tif --shape 8x8 --exposure 1e30 | --out x.tif --shape 8x8 --exposure 1e-12
@@ -104,6 +107,13 @@ def folder(tmp_path_factory) -> Path:
         (folder / name).mkdir()
     for name in ("bytes.json", "bytes.npz", "broken.png", "broken.tif"):
         (folder / name).write_bytes(b"\xff\xfe{}")
+    Image.fromarray(light.astype(np.uint8)).save(folder / "clean.png")
+    png = (folder / "clean.png").read_bytes()
+    (folder / "large.png").write_bytes(png[:16] + struct.pack(">II", 100_000, 100_000) + png[24:])
+    for name, suffix, length in (("clean", ".png", 50), ("clean", ".npy", 300), ("archive", ".npy", 300)):
+        content = (folder / f"{name}{suffix}").read_bytes()[:length]
+        (folder / f"cut{'-archive' if name == 'archive' else ''}{suffix}").write_bytes(content)
+    (folder / "no-bytes.npy").write_bytes(b"")
     (folder / "empty.json").write_text("")
     (folder / "file.txt").write_text("text")
     os.symlink("loop", folder / "loop")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import h5py
+import jax
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -12,6 +13,7 @@ from astropy.io import fits
 import hsnoise
 from hsnoise._core.output import read_image, write_atomically
 from hsnoise.cli.main import main
+from hsnoise.stlstm import STLSTM
 
 
 def counts(n: int = 3) -> np.ndarray:
@@ -108,7 +110,7 @@ def test_archives_and_objects_that_are_called_npy(tmp_path):
         hsnoise.load(archive, exposure_s=1)
     with pytest.raises(ValueError, match=r"a.npy: expected one array, got an archive"):
         read_image(archive)
-    with pytest.raises(ValueError, match=r"b.npy: cannot be read as an array of numbers"):
+    with pytest.raises(ValueError, match=r"b.npy: cannot be read as an image"):
         read_image(objects)
 
 
@@ -190,6 +192,35 @@ def test_white_levels_that_are_none(effect, white):
 def test_maps_that_begin_nowhere(first):
     with pytest.raises(ValueError, match="measured_map.first: expected a row and a column of the sensor, got"):
         hsnoise.effects.MeasuredMap(np.zeros((4, 6)), first=first)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("n 999999999999 16 24\nd 5\ni a.npy", "n: expected 1 to 32 bits, got 999999999999"),
+        ("n -5", "n: expected 1 to 32 bits, got -5"),
+        ("d", "expected a value after 'd', got 'd'"),
+        ("d 5\ni", "expected a value after 'i', got 'i'"),
+        ("", "expected lines that begin with i, one an image, got none"),
+        ("d 5\ni ../secret", "expected images of a known format"),
+    ],
+)
+def test_descriptors_of_emva(tmp_path, text, expected):
+    np.save(tmp_path / "a.npy", counts())
+    (tmp_path / "EMVA1288_Data.txt").write_text(text)
+    with pytest.raises(ValueError, match=f"cannot read .*EMVA1288_Data.txt: {expected}"):
+        hsnoise.load(tmp_path)
+
+
+def test_networks_of_thousands_of_layers():
+    with pytest.raises(ValueError, match="kernels: expected 1 to 64 sizes, one per layer, got 20000"):
+        STLSTM(jax.random.key(0), kernels=[3] * 20_000)
+
+
+@pytest.mark.parametrize("value", [True, "1.0", [True]])
+def test_truth_values_and_text_are_no_numbers(value):
+    with pytest.raises(TypeError, match="read_noise.sigma: expected a number, got"):
+        hsnoise.effects.ReadNoise(value)
 
 
 @pytest.mark.parametrize("packed", [False, True])

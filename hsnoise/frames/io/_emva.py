@@ -11,6 +11,7 @@ from hsnoise.frames.io._files import reader_name
 from hsnoise.frames.io._recording import Recording, naming
 
 DESCRIPTOR = "EMVA1288_Data.txt"
+MOST_BITS = 32
 KINDS = {"b": "flat", "d": "dark"}  # bright, dark
 
 
@@ -24,15 +25,26 @@ def read(folder: Path) -> list[Recording]:
     """
     path = folder / DESCRIPTOR
     with naming(path):
-        return list(_images(path))
+        found = list(_images(path))
+        if not found:
+            raise ValueError("expected lines that begin with i, one an image, got none")
+        return found
+
+
+def _white_level(bits: int) -> float:
+    if not 0 < bits <= MOST_BITS:
+        raise ValueError(f"n: expected 1 to {MOST_BITS} bits, got {bits}")
+    return 2.0**bits - 1
 
 
 def _images(path: Path) -> Iterator[Recording]:
     kind, exposure_s, white_level = "", 0.0, None
     for line in path.read_text().splitlines():
         word, *values = line.split() or ["#"]
+        if word in ("n", "i", *KINDS) and not values:
+            raise ValueError(f"expected a value after {word!r}, got {line!r}")
         if word == "n":
-            white_level = float(2 ** int(values[0]) - 1)
+            white_level = _white_level(int(values[0]))
         elif word in KINDS:
             kind, exposure_s = KINDS[word], float(values[0]) * 1e-9
         elif word == "i":
