@@ -7,6 +7,7 @@ import io
 import json
 import os
 import zipfile
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,9 @@ def _check_fields(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
         kinds = {"name": str, "parameters": dict, "settings": dict}
         if not all(isinstance(fields.get(name), kind) for name, kind in kinds.items()):
             raise ValueError(f"{path}: effect {i}: expected a name, parameters and settings, got {effect!r:.60}.")
+    twice = [name for name, n in Counter(effect["name"] for effect in effects).items() if n > 1]
+    if twice:  # before thousands of them are made
+        raise ValueError(f"{path}: effects: {', '.join(twice):.60} given twice; a model holds one effect per name.")
 
 
 def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
