@@ -120,7 +120,7 @@ def test_rows_of_a_group_share_their_offset(row_banks, column_banks):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"rows": 1}, "rows: expected a whole number at least 2, got 1"),
+        ({"rows": 1}, "rows: expected a whole number from 2 to 65536, got 1"),
         ({"rows": 4, "start": 4}, "start: expected a whole number from 0 to 3, got 4"),
         ({"column_banks": 3}, "column_banks: expected a whole number from 1 to 2, got 3"),
         ({"row_banks": 1.5}, "row_banks: expected a whole number from 1 to 2, got 1.5"),
