@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hsnoise._core.naming import named, setting
+from hsnoise._core.naming import setting
 from hsnoise.frames.io._kinds import folder_of, frames, names_of
 from hsnoise.frames.io._recording import Recording
 
@@ -51,7 +51,7 @@ def sort_out(read: Sequence[Recording], root: Path) -> Sorted:
         kept = [recording for i, recording in enumerate(kept) if i not in reasons]
         if not kept:
             raise ValueError(
-                f"{named('path')}: no dark and no flat frames: {'; '.join(told)}; give {setting('kind')} if they are"
+                f"{root}: no dark and no flat frames: {'; '.join(told)}; give {setting('kind')} if they are"
             )
     n = sum(r.n_frames for r in kept if _is_called_master(r, root))
     told += [f"{frames(n)} called master: are they averages? These have less noise than frames"] if n else []

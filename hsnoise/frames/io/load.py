@@ -28,9 +28,9 @@ def load(
     """Read a capture: dark frames, flat frames or both, of one camera at one gain setting.
 
     Only headers are read now, and one frame per file of flats; other frames are read one at a time when the stack is
-    iterated (.npz files are loaded whole). Frames of one kind whose exposures agree to 1e-3 form a group: darks first,
-    short before long. Flats of one exposure whose light differs by more than 5 % form several groups.
-    Arguments override what the files state; a warning reports exposures that differ.
+    iterated (.npz files are loaded whole, .gz files unpacked whole). Frames of one kind whose exposures agree to 1e-3
+    form a group: darks first, short before long. Flats of one exposure whose light differs by more than 5 % form
+    several groups. Arguments override what the files state; a warning reports exposures that differ.
 
     Frames that do not belong with the others (lights, masters, another format, size, binning, gain, ISO or temperature)
     are set aside, and flats of another crop go to `elsewhere`. The stack's `assumed` reports all this.
