@@ -45,6 +45,7 @@ MODEST = {
     "hot_pixels": 0.004,  # of the pixels
     "amplifier_glow": 60.0,  # e-/s in the corner
     "dark_current_nonuniformity": 0.15,  # relative, rms over pixels
+    "dark_current_instability": 0.1,  # relative, rms over frames
     "dark_current_drift": 0.25,  # relative, from the first frame of an exposure to the last
     "random_telegraph_noise": 0.03,  # of the pixels, 12 e-
     "heavy_tailed_read_noise": 5.0,  # degrees of freedom
@@ -73,7 +74,7 @@ ODD = (
     "gain_vignette",
     "gain_slope",
     "dark_vignette",
-    "dark_swing",
+    "checkerboard",
     "noise_over_frames",
     "noisy_odd_columns",
     "coupled_columns",
@@ -207,6 +208,8 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
         far = ((r - rows / 2) / rows) ** 2 + ((c - columns / 2) / columns) ** 2
         less = size * (far - far.mean())
         out.update({"gain": 1 - 0.5 * less} if effect == "gain_vignette" else {"rate": -camera.dark * less})
+    elif effect == "checkerboard":
+        out["offset"] = 1.5 * size * ((r // 2 + c // 2) % 2 - 0.5)
     elif effect == "gain_slope":
         out["gain"] = 1 + 0.3 * size * (c / columns - 0.5)
     elif effect == "noisy_odd_columns":
@@ -229,8 +232,9 @@ def _exposure(camera: Camera, sizes, hidden, t: float, rng, frames: int, shape) 
     rate = camera.dark + hidden.get("rate", 0.0)
     if drift := sizes.get("dark_current_drift"):
         rate = rate * (1 + drift * np.arange(frames)[:, None, None] / max(frames - 1, 1))
-    if swing := sizes.get("dark_swing"):
-        rate = rate * (1 + 0.1 * swing * np.sin(1.7 * np.arange(frames) + rng.uniform(0, 2 * np.pi)))[:, None, None]
+    if swing := sizes.get("dark_current_instability"):
+        phase = 1.7 * np.arange(frames) + rng.uniform(0, 2 * np.pi)
+        rate = rate * (1 + swing * np.sqrt(2) * np.sin(phase))[:, None, None]
     x = rng.poisson(np.broadcast_to(rate * t, whole)).astype(float)
     if excess := sizes.get("noisy_odd_columns"):
         x += np.sqrt(0.3 * excess * x * hidden["noisy"]) * rng.standard_normal(whole)

@@ -21,6 +21,7 @@ from hsnoise.effects.cosmic_rays import CosmicRays
 from hsnoise.effects.crosstalk import Crosstalk
 from hsnoise.effects.dark_current import DarkCurrent
 from hsnoise.effects.dark_current_drift import DarkCurrentDrift
+from hsnoise.effects.dark_current_instability import DarkCurrentInstability
 from hsnoise.effects.dark_current_nonuniformity import DarkCurrentNonuniformity
 from hsnoise.effects.dark_signal_nonuniformity import DarkSignalNonuniformity
 from hsnoise.effects.electron_multiplication import ElectronMultiplication
@@ -79,6 +80,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     HotPixels,
     AmplifierGlow,
     DarkCurrentDrift,
+    DarkCurrentInstability,
     DarkCurrentNonuniformity,
     RandomTelegraphNoise,
     HeavyTailedReadNoise,
@@ -123,6 +125,7 @@ __all__ = [
     "Crosstalk",
     "DarkCurrent",
     "DarkCurrentDrift",
+    "DarkCurrentInstability",
     "DarkCurrentNonuniformity",
     "DarkSignalNonuniformity",
     "EFFECTS",

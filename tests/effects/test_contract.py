@@ -31,6 +31,7 @@ from hsnoise.effects import (
     Crosstalk,
     DarkCurrent,
     DarkCurrentDrift,
+    DarkCurrentInstability,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
     ElectronMultiplication,
@@ -98,6 +99,7 @@ EXAMPLES = [
     HotPixels(0.2, 500.0),
     AmplifierGlow(200.0, 0.3),
     DarkCurrentDrift(60.0),
+    DarkCurrentInstability(0.3),
     DarkCurrentNonuniformity(0.4),
     RandomTelegraphNoise(0.5, 8.0, 0.4),
     HeavyTailedReadNoise(6.0),
@@ -150,7 +152,7 @@ each_effect = pytest.mark.parametrize("effect", EXAMPLES, ids=lambda effect: eff
 
 def model_of(effect):
     shaped = [ReadNoise(3.5)] if isinstance(effect, SHAPE_READ_NOISE) else []
-    shaped += [DarkCurrent(500.0)] if isinstance(effect, DarkCurrentNonuniformity) else []
+    shaped += [DarkCurrent(500.0)] if isinstance(effect, DarkCurrentInstability | DarkCurrentNonuniformity) else []
     return NoiseModel([effect, *shaped], cfa="RGGB", shutter="rolling", exposure_s=0.1)
 
 

@@ -9,11 +9,14 @@ import pytest
 from scipy import stats
 
 from hsnoise.effects import (
+    ADC,
     AmplifierGlow,
     CosmicRays,
     DarkCurrent,
     DarkCurrentDrift,
+    DarkCurrentInstability,
     DarkCurrentNonuniformity,
+    Gain,
     HotPixels,
     ReadNoise,
     ShotNoise,
@@ -102,6 +105,19 @@ def test_drift_grows_from_frame_to_frame():
     assert np.all(drawn[0] == 0)
     for f in range(1, 6):
         assert np.max(np.abs(poisson_z(drawn[f], 1.5 * 0.5 * f))) < 5
+
+
+def test_instability_scales_the_dark_current_of_whole_frames():
+    frames, exposure_s, spread, rate = 400, 0.5, 0.2, 4000.0
+    effects = [ShotNoise(), DarkCurrent(rate), DarkCurrentInstability(spread), Gain(1.0), ADC()]
+    camera = NoiseModel(effects, cfa="mono", shutter="global", exposure_s=exposure_s)
+    drawn = np.asarray(sample_dark(jax.random.key(3), frames, (32, 48), camera, exposure_s=exposure_s), float)
+    factor = drawn.mean((1, 2)) / (rate * exposure_s)
+    assert abs(factor.mean() - 1) < 4 * spread / np.sqrt(frames)
+    assert stats.kstest(np.log(factor), "norm", args=(-(spread**2) / 2, spread)).pvalue > P_VALUE
+    assert abs(drawn.var((1, 2)) / drawn.mean((1, 2)) - 1).mean() < 0.05  # within a frame, shot noise alone
+    again = np.asarray(sample_dark(jax.random.key(3), frames, (32, 48), camera, exposure_s=0.0))
+    assert np.all(again == 0)
 
 
 def test_cosmic_rays_are_rare_new_and_exponential():

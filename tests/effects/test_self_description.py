@@ -165,7 +165,14 @@ def test_what_is_proposed_is_the_effect(effect):
 def test_a_poor_capture_is_offered_little():
     offered = built_in(POOR)
     several_frames = {effect.name for effect in PROPOSED if effect.least_frames > 1}
-    assert several_frames == {"image_lag", "dark_current_drift", "frame_offset", "frame_settling", "black_shading"}
+    assert several_frames == {
+        "image_lag",
+        "dark_current_drift",
+        "dark_current_instability",
+        "frame_offset",
+        "frame_settling",
+        "black_shading",
+    }
     assert not several_frames & set(offered)
     assert not {"amplifier_glow", "dark_current_nonuniformity", "black_clamp", "nonlinearity"} & set(offered)
     assert {"row_noise", "hot_pixels", "cosmic_rays"} <= set(offered)
