@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from hsnoise.criticism import rules
 from hsnoise.criticism.held_out import Judge
 from hsnoise.criticism.outcomes import Improvement, Refusal, Refused
@@ -10,17 +12,19 @@ from hsnoise.criticism.story import Step
 from hsnoise.fitting.result import FitResult
 
 
-def judged(judge: Judge, before: FitResult, after: FitResult, added: str) -> Improvement | Refusal:
+def judged(
+    judge: Judge, before: FitResult, after: FitResult, added: str, tick: Callable[[], None]
+) -> Improvement | Refusal:
     """What a fit gains by an added effect, or why it is left out.
 
     The model must be better than the one before it, and also than itself without the effect: else only refitting the
-    others has helped.
+    others has helped. tick: called after each draw.
     """
     numbers = len(after.names) - len(before.names)
-    gain = judge.improvement(before.params, after.params, numbers)
+    gain = judge.improvement(before.params, after.params, numbers, tick)
     if not gain.holds:
         return Refusal(Refused.NO_BETTER, gain)
-    by_itself = judge.improvement(after.params.remove(added), after.params, numbers)
+    by_itself = judge.improvement(after.params.remove(added), after.params, numbers, tick)
     return gain if by_itself.holds else Refusal(Refused.NO_CHANGE, by_itself)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -64,10 +65,8 @@ class Judge:
     kept: tuple[dict, dict] = field(default_factory=lambda: ({}, {}))
 
     @staticmethod
-    def of(fitted: FrameStack, held_out: FrameStack | None, seed: int) -> Judge:
-        """Of the frames of a fit, and of the darks held out, if any."""
-        if held_out is None:
-            return Judge(Portion.of(fitted), False, seed)
+    def of(fitted: FrameStack, held_out: FrameStack, seed: int) -> Judge:
+        """Of the darks held out from a fit, and of its flats."""
         before = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
         flats = [i for i, kind in enumerate(fitted.kind) if kind == "flat"]
         stack = FrameStack.join(held_out, fitted.select(exposures=flats)) if flats else held_out
@@ -83,9 +82,14 @@ class Judge:
         simulator = self._simulator(model)
         return log_score(simulator.reference(model, self._draws(simulator)), simulator.measured.values)
 
-    def improvement(self, before: NoiseModel, after: NoiseModel, numbers: int) -> Improvement:
-        """By how much one model predicts the frames better than another; numbers: how many more were fitted for it."""
-        simulator = self._simulator(before, after)
+    def improvement(
+        self, before: NoiseModel, after: NoiseModel, numbers: int, tick: Callable[[], None] = lambda: None
+    ) -> Improvement:
+        """By how much one model predicts the frames better than another.
+
+        numbers: how many more were fitted for it; tick: called after each draw.
+        """
+        simulator = replace(self._simulator(before, after), tick=tick)
         draws, values = self._draws(simulator), simulator.measured.values
         old, new = (simulator.reference(model, draws) for model in (before, after))
         batches = np.array_split(np.arange(draws), BATCHES)

@@ -128,7 +128,8 @@ def improved(
     portion = Portion.of(fitted)
     _check_start(model, candidates, portion, seed)
     limit = Limit.of(max_minutes, max_steps)
-    judge, split = Judge.of(fitted, held_out, seed), split_in_words(fitted, held_out)
+    judge = Judge(portion, False, seed) if held_out is None else Judge.of(fitted, held_out, seed)
+    split = split_in_words(fitted, held_out)
     work = _Work(fitted, portion, judge, seed, tell, limit, model is not None)
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
@@ -290,11 +291,7 @@ class _Work:
         refused: dict[str, Refusal] = {}
         for candidate in candidates:
             found = self.with_one_more(steps, candidate)
-            why = (
-                Refusal(Refused.NOT_FITTED)
-                if found is None
-                else judged(self.judge, steps[-1].fit, found[0], candidate.name)
-            )
+            why = Refusal(Refused.NOT_FITTED) if found is None else self.judged(steps, found[0], candidate.name)
             if isinstance(why, Improvement):
                 step = self.step(found[0], candidate.name, steps)
                 held_out = steps[-1].held_out + why.nats  # NaN if no frames are held out
@@ -303,6 +300,12 @@ class _Work:
             refused[candidate.name] = why
             self.say(Event(f"{candidate.name} is left out: {sentences.refusal(why)}"))
         return None, refused
+
+    def judged(self, steps: list[Step], result: FitResult, added: str) -> Improvement | Refusal:
+        """What the judge says of a fit with one effect more."""
+        stage = _stage(f"judging {added} by frames {'held out' if self.judge.unseen else 'that were fitted'}", steps)
+        self.say(stage)
+        return judged(self.judge, steps[-1].fit, result, added, self.counter(stage))
 
     def with_one_more(self, steps: list[Step], candidate: Candidate) -> tuple[FitResult, float] | None:
         """A fit with the candidate, on the side of the gain where it fits better, and by how much, nats.

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import hsnoise
 import hsnoise.effects as fx
-from hsnoise.criticism.held_out import Judge
-from hsnoise.criticism.outcomes import Improvement
+from hsnoise.criticism import held_out as of_frames
+from hsnoise.criticism.acceptance import judged
+from hsnoise.criticism.held_out import LEAST_DRAWS, Judge
+from hsnoise.criticism.outcomes import Improvement, Refused
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
 
@@ -16,6 +20,11 @@ BASE = (fx.ShotNoise(), fx.DarkCurrent(20.0), fx.ReadNoise(4.0), fx.Gain(2.0), f
 MODEL = hsnoise.NoiseModel(BASE, cfa="mono", shutter="global", exposure_s=0.1)
 ROWS = MODEL.add(fx.RowNoise(1.5))
 DRIFT = MODEL.add(fx.DarkCurrentDrift(4.0))
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    monkeypatch.setattr(of_frames, "DRAWS", of_frames.LEAST_DRAWS)
 
 
 def empty_stack(frames: int, shape: tuple[int, int] = (48, 64)) -> hsnoise.FrameStack:
@@ -67,10 +76,24 @@ def test_later_frames_of_a_series_are_those_of_the_whole():
 
 
 def test_frames_that_a_fit_has_seen_cost_a_nat_for_each_number():
-    seen = Judge.of(capture(ROWS), None, 0)
+    seen = Judge(Portion.of(capture(ROWS)), False, 0)
     assert seen.improvement(MODEL, ROWS, 3).cost == 3 and not seen.unseen
     assert not Improvement(5.0, 0.1, 3).holds and Improvement(5.0, 0.1, 0).holds
     assert not Improvement(5.0, 2.0, 0).holds  # within the scatter of its simulation
+
+
+def test_an_effect_must_be_better_than_the_model_and_than_itself_without_it():
+    judge, ticks = Judge.of(*split(capture(ROWS), 6), 0), []
+
+    def told(before, after, added):
+        fits = (SimpleNamespace(params=model, names=()) for model in (before, after))
+        return judged(judge, *fits, added, lambda: ticks.append(1))
+
+    found = told(MODEL, ROWS, "row_noise")
+    assert isinstance(found, Improvement) and len(ticks) == 2 * LEAST_DRAWS  # without it, it is the model before
+    assert told(ROWS, ROWS.add(fx.FrameOffset(1e-3)), "frame_offset").why == Refused.NO_BETTER
+    only_refitted = ROWS.add(fx.FrameOffset(1e-3))
+    assert told(MODEL, only_refitted, "frame_offset").why == Refused.NO_CHANGE
 
 
 def test_flats_are_judged_beside_the_darks_held_out():

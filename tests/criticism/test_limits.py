@@ -101,9 +101,9 @@ def test_flats_are_compared_if_the_fit_that_the_story_starts_from_has_a_gain(mon
     """Pooled pixels may leave it unknown where each pixel over time, and the flats, give it."""
     without, told = object(), []
     portion = SimpleNamespace(without_flats=lambda why: without)
-    followed = SimpleNamespace(has_gain=True)
+    followed, judge = SimpleNamespace(has_gain=True), SimpleNamespace(without_flats=None)
     monkeypatch.setattr(_Work, "begun", lambda self, first: told.append((first, self.portion)) or [first])
     monkeypatch.setattr(_Work, "pixels_followed", lambda self, steps: followed)
     pooled = SimpleNamespace(has_gain=False)
-    assert _Work(None, portion, None, 0, print).started(pooled) == [followed]
+    assert _Work(None, portion, judge, 0, print).started(pooled) == [followed]
     assert told == [(pooled, without), (followed, portion)]

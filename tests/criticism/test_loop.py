@@ -202,7 +202,7 @@ def test_improve_decides_the_side_of_the_gain_by_refits(tmp_path):
     stack, told = simulated(tmp_path)[0], []
     steps = [Step(hsnoise.fit(stack), SimpleNamespace(error=9.0), None, None, float("nan"), ())]
     wrong = SimpleNamespace(name="row_noise", effect=fx.RowNoise(1.4, after_gain=True))
-    work = _Work(stack, Portion.of(stack), Judge.of(stack, None, 0), 0, lambda event: told.append(str(event)))
+    work = _Work(stack, Portion.of(stack), Judge(Portion.of(stack), False, 0), 0, lambda event: told.append(str(event)))
     fit, ahead = work.with_one_more(steps, wrong)
     assert fit.params["row_noise"].after_gain is False and ahead > 0 and hsnoise.compare(fit, stack).fits
     assert any("adding row_noise" in sentence for sentence in told)
@@ -262,7 +262,7 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     of = importlib.import_module("hsnoise.criticism.improve")
     monkeypatch.setattr(_Work, "with_one_more", with_one_more)
     monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
-    monkeypatch.setattr(of, "judged", lambda judge, before, after, name: why[name])
+    monkeypatch.setattr(_Work, "judged", lambda self, steps, fit, name: why[name])
     monkeypatch.setattr(of, "rechecked", lambda *of: checked)
     work = _Work(None, None, None, 0, lambda event: told.append(str(event)))
     reasons = {"row_noise": Refusal(Refused.NOT_FITTED), "frame_offset": alike}
