@@ -18,7 +18,8 @@ from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import structure
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
-DRAWS, LEAST_DRAWS, BATCHES = 96, 40, 4  # of a model that is judged; batches of them tell the error of the simulation
+DRAWS, LEAST_DRAWS = 96, 40  # of a model that is judged
+GROUPS = 8  # of draws; without one after the other (jackknife), they tell the error of the simulation
 MOST_DRAWN = 60_000_000  # pixels of the draws of a model
 SIDE_DRAWS = 40
 
@@ -92,10 +93,10 @@ class Judge:
         simulator = replace(self._simulator(before, after), tick=tick)
         draws, values = self._draws(simulator), simulator.measured.values
         old, new = (simulator.reference(model, draws) for model in (before, after))
-        batches = np.array_split(np.arange(draws), BATCHES)
-        parts = [log_score(new.of_draws(some), values) - log_score(old.of_draws(some), values) for some in batches]
+        others = [np.delete(np.arange(draws), some) for some in np.array_split(np.arange(draws), GROUPS)]
+        parts = [log_score(new.of_draws(some), values) - log_score(old.of_draws(some), values) for some in others]
         cost = 0 if self.unseen and "flat" not in self.portion.frames.kind else numbers
-        error = float(np.std(parts, ddof=1) / np.sqrt(BATCHES))
+        error = float(np.sqrt((GROUPS - 1) * np.var(parts)))
         return Improvement(log_score(new, values) - log_score(old, values), error, cost)
 
     def _simulator(self, *models: NoiseModel) -> Simulator:
