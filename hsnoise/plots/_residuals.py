@@ -72,13 +72,12 @@ def residuals(params: NoiseModel | FitResult, stack, *, seed: int = 0, **keyword
     model = params.params if isinstance(params, FitResult) else params
     stack = as_stack(stack, **keywords)
     check_fits(model, stack)
-    darks = Portion.of(stack).darks.frames.select(frames=slice(0, MOST_FRAMES))
-    check_effects(model, darks)
-    repeated = [i for i, n in enumerate(darks.n_frames) if n > 1]
+    repeated = [i for i, n in enumerate(stack.n_frames) if n > 1 and stack.kind[i] == "dark"]
     if not repeated:
         raise ValueError("stack: residuals need a dark exposure of two frames or more")
-    ends = dict.fromkeys([repeated[int(i)] for i in (np.argmax(_of(darks, repeated)), np.argmin(_of(darks, repeated)))])
-    part = darks.select(exposures=list(ends))
+    ends = {end(repeated, key=lambda i: stack.exposure_s[i]) for end in (min, max)}
+    part = Portion.of(stack.select(exposures=sorted(ends), frames=slice(0, MOST_FRAMES))).frames
+    check_effects(model, part)
     side = max(4, 2 * round(max(part.shape) / BLOCKS / 2))
     captures = [part, *in_threads(lambda i: draw_capture(seed + i, model, part), range(DRAWS))]
     found = [
@@ -86,10 +85,6 @@ def residuals(params: NoiseModel | FitResult, stack, *, seed: int = 0, **keyword
     ]
     chosen = int(np.argmax([_stands_out(of) for of in found]))
     return _drawn(found[chosen], part, chosen, side)
-
-
-def _of(darks: FrameStack, exposures: list[int]) -> np.ndarray:
-    return np.asarray(darks.exposure_s)[exposures]
 
 
 def _blocks(pixels: np.ndarray, side: int) -> np.ndarray:
