@@ -14,6 +14,7 @@ from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
 from hsnoise.fitting.notes import closing_notes, outlier_fraction
 from hsnoise.fitting.pixel_result import POPULATION, result_of
+from hsnoise.fitting.problem import check_named
 from hsnoise.fitting.profile import profile_errors
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.fitting.simulated import fit_synthetic
@@ -106,6 +107,7 @@ def fit(
         raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")
     if model is not None:
         check_fits(model, source, "model")  # before the frames are read
+        check_named(model)
     extra = () if model is None else without_likelihood(model)
     found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
     measurable = found is not None and (model is None or "black_clamp" not in model)

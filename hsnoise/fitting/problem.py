@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.naming import named
 from hsnoise.effects import Stage
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
@@ -170,3 +171,13 @@ class Problem:
         base, own = np.abs(self.whiten @ step[:n]) / self.sizes, np.abs(step[n:])
         longest = max(base.max() / LONGEST_OF_BASE, own.max(initial=0.0) / LONGEST_STEP)
         return min(1.0, 1 / max(longest, 1e-12))
+
+
+def check_named(model: NoiseModel) -> None:
+    """Raise ValueError for a model with measured components: maps of a sensor are not numbers that a fit moves."""
+    measured = [effect.name for effect in model if effect.arrays()]
+    if measured:
+        raise ValueError(
+            f"{named('model')}: expected effects with numbers to fit, got what was measured of one sensor"
+            f" ({', '.join(measured)}); fit the named model that was closed (named.json of improve --close)"
+        )

@@ -101,6 +101,15 @@ def test_a_bayer_sensor_of_one_exposure():
     assert drawn.counts[0].mean() == pytest.approx(held_out.counts[0].mean(), abs=1.0)
 
 
+@pytest.mark.parametrize("call", [hsnoise.fit, hsnoise.improve])
+def test_a_closed_model_is_no_start_of_a_fit(wild, call):
+    seen, _ = wild_sensor()
+    with pytest.raises(
+        ValueError, match=r"model: expected effects with numbers to fit, got .*measured_map.*named.json"
+    ):
+        call(seen, model=wild.params)
+
+
 def test_what_cannot_be_closed_is_named():
     seen, _ = wild_sensor()
     with pytest.raises(ValueError, match="stack: expected two frames or more of a dark exposure"):
