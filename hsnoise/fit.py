@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from hsnoise._core.forking import check_not_forked
 from hsnoise._core.naming import named
 from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, confirmed
 from hsnoise.fitting.line import line_fit
@@ -91,7 +92,7 @@ def fit(
     Raises:
         FileNotFoundError, TypeError, ValueError: for bad input, before any long work; ValueError for effects that
             cannot be fitted.
-        RuntimeError: if method="ml" does not converge.
+        RuntimeError: if method="ml" does not converge; in a process that was forked after JAX had started.
 
     Reference: Wang et al., "Enhancing Low Light Videos by Exploring High Sensitivity Camera Noise", ICCV 2019; the
     likelihood is derived in docs/likelihood.md.
@@ -102,6 +103,7 @@ def fit(
         raise ValueError(f"pixels: expected one of {', '.join(PIXELS)}, got {pixels!r}")
     if model is not None and not isinstance(model, NoiseModel):
         raise TypeError(f"{named('model')}: expected a NoiseModel, got {type(model).__name__}")
+    check_not_forked()
     source = stack if isinstance(stack, Summary) else as_stack(stack, **keywords)
     if isinstance(source, Summary) and (method == "transfer" or pixels == "differ"):
         raise ValueError("stack: pixel transfer needs the frames themselves, got a Summary of them")

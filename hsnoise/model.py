@@ -21,6 +21,7 @@ from jaxtyping import Array
 from hsnoise._core import html as _html
 from hsnoise._core.arguments import listed, whole_number
 from hsnoise._core.data_frames import table_to_pandas
+from hsnoise._core.forking import check_not_forked
 from hsnoise._core.keys import key_of, named_key
 from hsnoise._core.poisson import Regime, regime_of
 from hsnoise._core.types import RandomKey, Scalar, Window, channels_of, check_shutter, is_traced, unit_in_words
@@ -318,6 +319,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     """Checked input: key, photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
+    check_not_forked()
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else key_of("sensor_key", sensor_key)
     dtype = jnp.result_type(float)

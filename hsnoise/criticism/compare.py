@@ -15,6 +15,7 @@ from hsnoise._core import html as _html
 from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise._core.conclusion import Conclusion, Light
 from hsnoise._core.data_frames import data_frame
+from hsnoise._core.forking import check_not_forked
 from hsnoise._core.threads import in_threads
 from hsnoise.criticism import rules, sentences, shares
 from hsnoise.criticism.shares import Share
@@ -173,6 +174,7 @@ def compare(
     """
     draws, seed = whole_number("draws", draws, 8), seed_of("seed", seed)
     tick = callback("progress", progress)
+    check_not_forked()
     stack = as_stack(stack, **keywords)
     params = params.params if isinstance(params, FitResult) else params
     check_fits(params, stack)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from hsnoise._core.arguments import callback, seed_of, whole_number
+from hsnoise._core.forking import check_not_forked
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import (
     Suspect,
@@ -75,6 +76,7 @@ def diagnose(
     """
     tick = callback("progress", progress)
     draws, seed = whole_number("draws", draws, MANY_DETAILS), seed_of("seed", seed)
+    check_not_forked()
     stack = as_stack(stack, **keywords)
     model = fit.params if isinstance(fit, FitResult) else fit
     if not isinstance(model, NoiseModel):
