@@ -141,9 +141,9 @@ def test_an_interrupt_keeps_the_steps_until_then(folder, whole, tmp_path, monkey
         with pytest.raises(SystemExit):
             run_train(arguments(folder, tmp_path / "run"))
     assert [path.name for path in checkpoints.checkpoints(tmp_path / "run")] == ["checkpoint-00000004.eqx"]
-    assert "the same command resumes here" in capsys.readouterr().out
+    assert "the same command resumes here" in capsys.readouterr().err
     run_train(arguments(folder, tmp_path / "run"))
-    assert "Resuming from step 4" in capsys.readouterr().out
+    assert "Resuming from step 4" in capsys.readouterr().err
     for one, other in zip(leaves(whole / train.ENDED), leaves(tmp_path / "run" / train.ENDED), strict=True):
         np.testing.assert_array_equal(one, other)
     run_train(arguments(folder, tmp_path / "run"))
@@ -256,7 +256,7 @@ def test_rivals_that_are_not_installed_are_named_with_their_extra(monkeypatch, c
     monkeypatch.setattr("hsnoise.enhance.training.rivals.find_spec", lambda name: None)
     monkeypatch.setattr(evaluate, "rivals", dict)  # the others take minutes
     evaluate.methods_of(None, None, untrained=True)
-    assert "BM3D and BM4D over frames are left out: pip install 'hsnoise[peers]'" in capsys.readouterr().out
+    assert "BM3D and BM4D over frames are left out: pip install 'hsnoise[peers]'" in capsys.readouterr().err
 
 
 def test_rivals_make_noisy_frames_better():
@@ -316,10 +316,10 @@ def test_weights_are_judged_with_the_camera_and_light_of_their_training(folder, 
         run_evaluate(judge)
     assert "--camera: the weights were trained for model" in capsys.readouterr().err
     run_evaluate([*judge, "--camera", str(model)])
-    assert "other noise" not in capsys.readouterr().out
+    assert "other noise" not in capsys.readouterr().err
     assert "2 e- to 10 e-" in (tmp_path / "found" / "evaluation.md").read_text()
     run_evaluate([*judge, "--camera", str(other)])
-    assert "other noise" in capsys.readouterr().out
+    assert "other noise" in capsys.readouterr().err
 
 
 def mono_camera(mean_e=(20.0, 20.0)):

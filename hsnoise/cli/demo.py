@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hsnoise import report
+from hsnoise._core.folders import made
 from hsnoise._core.output import frames_file, write_atomically, write_figure
 from hsnoise.cli.loading import load_capture
 from hsnoise.cli.progress import fit_with_progress
@@ -37,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
         if args.data:
             raise ValueError("--real: uses the frames that come with hsnoise, so it does not go with --data")
         night = str(examples.st8(args.out / "night"))
-        print(f"The frames of an SBIG ST-8, an astronomical CCD camera, are in {night}. So is their licence: CC0.")
+        _say(f"The frames of an SBIG ST-8, an astronomical CCD camera, are in {night}. So is their licence: CC0.")
         args.data = [night]
     if args.data:
         _on_frames(args, load_capture(args.data, args), {"files": args.data}, limits)
@@ -51,8 +53,8 @@ def _on_frames(
 ) -> None:
     """The loop on frames without a known truth; only a fit if they do not determine the gain."""
     stack.check()
-    args.out.mkdir(parents=True, exist_ok=True)
-    print(stack)
+    made(args.out)
+    _say(str(stack))
     fit = fit_with_progress(stack, "auto")
     if fit.has_gain:
         _improved(args, stack, source, {**limits, "max_minutes": limits["max_minutes"] or MINUTES})
@@ -69,8 +71,8 @@ def _improved(
     truth: NoiseModel | None = None,
 ) -> None:
     page = args.out / "report.html"
-    print(f"Fitting them, finding what the model lacks, and fitting again: a few minutes. Open {page}", flush=True)
-    print("in a browser for the story so far, with figures; it is updated after each step.", flush=True)
+    _say(f"Fitting them, finding what the model lacks, and fitting again: a few minutes. Open {page}")
+    _say("in a browser for the story so far, with figures; it is updated after each step.")
     story = improve_with_progress(stack, SEED, args.out, source, page=page, **limits)
     foot = [f"Written to {args.out}/: {', '.join([*keep(story, args.out, source), 'story.png'])}"]
     write_figure(args.out / "story.png", story.plot())
@@ -88,9 +90,14 @@ def simulated(out: Path) -> tuple[FrameStack, NoiseModel]:
     """Darks with a hidden effect, saved as capture.npz, and the model they are drawn from."""
     truth = cameras.canon_5d3().add(HIDDEN)
     rows, columns = SHAPE
-    print(f"Simulating {len(EXPOSURES_S) * FRAMES} dark frames of {rows} x {columns} pixels ...", flush=True)
+    _say(f"Simulating {len(EXPOSURES_S) * FRAMES} dark frames of {rows} x {columns} pixels ...")
     counts = draw(truth, EXPOSURES_S, FRAMES, np.zeros(SHAPE, np.float32), SEED)
     metadata = metadata_of(truth, EXPOSURES_S, "dark")
-    out.mkdir(parents=True, exist_ok=True)
+    made(out)
     write_atomically(out / "capture.npz", frames_file(".npz", counts, metadata))
     return FrameStack(counts, **metadata), truth
+
+
+def _say(sentence: str) -> None:
+    """Print words about the work to come, beside the result."""
+    print(sentence, file=sys.stderr, flush=True)

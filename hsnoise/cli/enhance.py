@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from hsnoise._core.folders import sweep
 from hsnoise._core.types import channels_of
 from hsnoise.chain.photometry import GREY, frames_of_display, light_of_frames
 from hsnoise.effects import BlackLevel
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     frames = enhance(net, _noted(light, about), tile=args.tile)
     shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
     rate = frame_rate_of(args.video, args.rate)
+    sweep(args.out.parent)
     with _terminable():
         count = write_video(args.out, (_pixels(frame) for frame in shown), rate)
     print(f"{args.out}: {count} frames at {float(rate):g} a second")

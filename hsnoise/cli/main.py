@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rich.console import Console
 
@@ -18,6 +19,7 @@ from hsnoise import report
 from hsnoise._core import interrupting as _interrupting
 from hsnoise._core.conclusion import Light
 from hsnoise._core.events import Event, counter
+from hsnoise._core.folders import made
 from hsnoise._core.naming import as_options
 from hsnoise._core.output import write_figure
 from hsnoise.cli import demo as _demo
@@ -28,6 +30,7 @@ from hsnoise.cli.as_json import as_json
 from hsnoise.cli.loading import load_capture, model_of, same_capture
 from hsnoise.cli.progress import busy, fit_with_progress
 from hsnoise.cli.results import check_folder, improve_with_progress, keep, story_in, write_results
+from hsnoise.cli.streams import Unfailing, drop_unwritten
 from hsnoise.cli.telling import (
     Page,
     page_of_comparison,
@@ -82,19 +85,19 @@ def main(argv: list[str] | None = None) -> int:
     141 if the reader of the output is gone; 130 after Ctrl-C. docs/command-line.md says more.
     """
     _interrupting.on_disk("")
-    try:
+    out, words = sys.stdout or StringIO(), cast(Any, Unfailing(sys.stderr or StringIO()))  # they may be closed
+    with redirect_stdout(out), redirect_stderr(words):
         try:
             return _run(argv)
+        except BrokenPipeError:
+            return BROKEN_PIPE
+        except KeyboardInterrupt:
+            print(_interrupting.message(), file=sys.stderr)
+            return _interrupting.STATUS
         finally:
-            sys.stdout.flush()  # notice a closed pipe here, not while Python shuts down
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BROKEN_PIPE
-    except KeyboardInterrupt:
-        print(_interrupting.message(), file=sys.stderr)
-        return _interrupting.STATUS
-    finally:
-        _interrupting.nothing_left()
+            drop_unwritten(out)
+            words.flush()
+            _interrupting.nothing_left()
 
 
 def _run(argv: list[str] | None) -> int:
@@ -110,7 +113,9 @@ def _run(argv: list[str] | None) -> int:
             warnings.showwarning = lambda message, *_, **__: console.print(
                 f"Note: {message}.", style="yellow", markup=False
             )
-            return RUN[args.command](args) or 0
+            status = RUN[args.command](args) or 0
+            sys.stdout.flush()  # notice here that it cannot be written
+            return status
     except BrokenPipeError:
         raise
     except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
@@ -143,7 +148,7 @@ def _fit(args: argparse.Namespace) -> int:
         with as_options({"path": "--maps"}):
             check_path(args.maps, made=args.out)
     model, stack = None if args.model is None else model_of(args.model), _load(args)
-    args.out.mkdir(parents=True, exist_ok=True)  # fail before the long work
+    made(args.out)  # fail before the long work
     fit = fit_with_progress(stack, args.method, model, args.pixels)
     written = write_results(fit, args.out, {"files": args.paths})
     files = [args.out / name for name in written]
@@ -162,7 +167,7 @@ def _compare(args: argparse.Namespace) -> None:
     _check_outputs(args)
     model, stack = model_of(args.model), _load(args)
     check_fits(model, stack)
-    args.out.mkdir(parents=True, exist_ok=True)
+    made(args.out)
     found = _compared(model, stack, args.seed)
     last = []
     if found.conclusion.light != Light.GREEN:
@@ -179,7 +184,7 @@ def _diagnose(args: argparse.Namespace) -> None:
     _check_outputs(args)
     stack = _load(args)
     Portion.of(stack)  # rejects a capture of flats alone before the fit
-    args.out.mkdir(parents=True, exist_ok=True)
+    made(args.out)
     fitted = fit_with_progress(stack, args.method) if args.model is None else model_of(args.model)
     text = "Drawing each effect that may be missing"
     with busy(text) as say:
@@ -194,7 +199,7 @@ def _diagnose(args: argparse.Namespace) -> None:
 def _improve(args: argparse.Namespace) -> int:
     _check_outputs(args)
     stack = _load(args)
-    args.out.mkdir(parents=True, exist_ok=True)
+    made(args.out)
     start, source = None if args.model is None else model_of(args.model), {"files": args.paths}
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     if args.resume:
@@ -310,7 +315,7 @@ def _train(args: argparse.Namespace) -> None:
     from hsnoise.enhance.training.train import run  # optax and matplotlib are slow to import
 
     with _interrupting.as_exception():  # it keeps the last checkpoint
-        run(args, Console(highlight=False, soft_wrap=True))
+        run(args, Console(stderr=True, highlight=False, soft_wrap=True))
 
 
 def _evaluate(args: argparse.Namespace) -> None:

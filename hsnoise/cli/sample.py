@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from hsnoise._core.folders import sweep
 from hsnoise._core.output import FRAME_FORMATS, frames_file, read_image, write_atomically
 from hsnoise._core.types import cfa_tile
 from hsnoise.chain.model_file import read_model
@@ -62,6 +63,7 @@ def run(args: argparse.Namespace) -> None:
         )
     counts = draw(model, exposures_s, args.frames, clean, args.seed)
     metadata = metadata_of(model, exposures_s, "flat" if args.clean else "dark")
+    sweep(args.out.parent)
     write_atomically(args.out, frames_file(suffix, counts, metadata))
     print("\n".join(_told(args.out, counts, metadata)))
 

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
-import subprocess
-import sys
-import time
 
 import jax
 import numpy as np
@@ -20,7 +16,7 @@ from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
 from hsnoise.criticism.resume import OF_FRAMES, read_steps
 from hsnoise.criticism.shares import Share
-from hsnoise.effects import BlackClamp, FrameOffset, RowNoise
+from hsnoise.effects import BlackClamp, RowNoise
 from hsnoise.fitting.result import Method, Status
 
 CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
@@ -133,41 +129,3 @@ def test_measured_arrays_have_no_place_in_it(story, tmp_path):
     closed = dataclasses.replace(story.steps[0], fit=dataclasses.replace(story.fit, params=whole))
     with pytest.raises(TypeError, match="expected values of a story, got MeasuredMap"):
         write_story(tmp_path / "story.json", dataclasses.replace(story, steps=(closed,)))
-
-
-@pytest.mark.slow
-def test_killed_at_any_moment_it_goes_on_to_the_same_end(tmp_path):
-    model = CAMERA.add(RowNoise(1.5)).add(FrameOffset(1.0))
-    for i, t in enumerate((0.05, 0.4)):
-        counts = hsnoise.sample_dark(jax.random.key(i), 12, (48, 64), model, exposure_s=t, sensor_key=1)
-        np.savez(tmp_path / f"dark{i}.npz", counts=np.asarray(counts), exposure_s=t, black_level=64, cfa=CAMERA.cfa)
-
-    def run(out, *words):
-        files = [str(tmp_path / f"dark{i}.npz") for i in (0, 1)]
-        command = [
-            sys.executable,
-            "-m",
-            "hsnoise",
-            "improve",
-            *files,
-            "--shutter",
-            "global",
-            "--out",
-            str(tmp_path / out),
-        ]
-        return subprocess.Popen([*command, "--max-steps", "2", *words], stdout=subprocess.DEVNULL)
-
-    began = time.monotonic()
-    assert run("whole").wait() in (0, 1)
-    took = time.monotonic() - began
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        process = run("killed", "--resume")
-        try:
-            process.wait(timeout=rng.uniform(0.2, 0.9) * took)
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-    assert run("killed", "--resume").wait() in (0, 1)
-    for name in ("story.txt", "table.csv"):
-        assert (tmp_path / "killed" / name).read_text() == (tmp_path / "whole" / name).read_text()

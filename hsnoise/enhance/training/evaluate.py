@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 from skimage.metrics import structural_similarity
 
+from hsnoise._core.folders import made
 from hsnoise._core.output import write_atomically, write_figure
 from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Clip, check_sizes, read_clips, source_of
@@ -73,7 +75,7 @@ def camera_for(about: dict, options: argparse.Namespace) -> Camera:
     sensor = options.sensor or (tuple(about["sensor"]) if about.get("sensor") else None)
     camera = replace(camera_of(name, options.lux, mean_e, options.exposure), sensor=sensor)
     if about.get("digests", {}).get("camera") != digest_of(camera.model):
-        print(f"Note: {options.weights} was trained for other noise than that of {camera.name}, on which it is scored")
+        _note(f"{options.weights} was trained for other noise than that of {camera.name}, on which it is scored")
     return camera
 
 
@@ -82,7 +84,7 @@ def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: 
     if net.channels != camera.channels:
         raise ValueError(f"{path}: weights for {net.channels} channels, camera {camera.name} has {camera.channels}")
     if "clips" not in about:
-        print(f"Note: {path} does not say which clips it was trained on; those scored may be among them")
+        _note(f"{path} does not say which clips it was trained on; those scored may be among them")
     names, digests = (set(map(source_of, about.get("clips", ()))), about.get("trained_on", ()))
     seen = sorted({clip.source for clip in scored if clip.source in names or digest_of(clip.frames) in digests})
     if seen:
@@ -92,9 +94,7 @@ def check_weights(path: Path, net: STLSTM, about: dict, camera: Camera, scored: 
 def note_protocol(path: Path, about: dict) -> None:
     """Say under which protocol weights were trained, if it is not that of the scores."""
     if about.get("protocol") != PROTOCOL:
-        print(
-            f"Note: {path} was trained by {about.get('protocol', 'an unknown protocol')}, and is scored by {PROTOCOL!r}"
-        )
+        _note(f"{path} was trained by {about.get('protocol', 'an unknown protocol')}, and is scored by {PROTOCOL!r}")
 
 
 def while_memory_fills(net, scene: Scene) -> dict[str, list[float]]:
@@ -122,7 +122,7 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
         OURS: lambda scene: net(scene.noisy[:, None])[:, 0],
     }
     if untrained and not_installed():
-        print(f"Note: {' and '.join(not_installed())} are left out: pip install 'hsnoise[peers]'")
+        _note(f"{' and '.join(not_installed())} are left out: pip install 'hsnoise[peers]'")
     for name, denoise in rivals().items() if untrained else ():
         found[name] = prepared(name, denoise, tuning)
     return found
@@ -131,7 +131,7 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
 def prepared(name: str, denoise: Denoiser, tuning: Scene) -> Method:
     """A rival that is not trained, with the strength and domain that do best on a scene that is not scored."""
     strength, domain = tuned(denoise, tuning)
-    print(f"{name}: best at {strength:g} times the noise in {domain}", flush=True)
+    print(f"{name}: best at {strength:g} times the noise in {domain}", file=sys.stderr, flush=True)
     return partial(denoised, denoise, strength=strength, domain=domain)
 
 
@@ -155,7 +155,7 @@ def run(options: argparse.Namespace) -> None:
     if options.crop < LEAST_CROP:
         raise ValueError(f"--crop: expected at least {LEAST_CROP} pixels, as SSIM needs, got {options.crop}")
     network, about = load_network(options.weights)
-    options.out.mkdir(parents=True, exist_ok=True)
+    made(options.out)
     camera = camera_for(about, options)
     split = split_of(read_clips(options.clips), options.split)
     check_sizes(sum(split, []), LEAST_FRAMES, LEAST_CROP)
@@ -190,14 +190,20 @@ def scored(net, split: Split, camera: Camera, options: argparse.Namespace) -> tu
 
 
 def write_results(records: list[dict], filling: dict, camera: Camera, options: argparse.Namespace) -> None:
-    """evaluation.md, frames.csv and curves.png."""
+    """evaluation.md, frames.csv and curves.png; then the tables are printed."""
     sheets = [*tables(records, camera.in_words), memory_sheet(filling)]
-    for sheet in (*sheets[:2], sheets[-1]):
-        Console(width=150).print(sheet.rich())
     light = f"{camera.in_words(camera.mean_e[0])} to {camera.in_words(camera.mean_e[1])}"
     title = f"{options.weights}: camera {camera.name}, {light}, the middle {options.crop} pixels of each frame\n"
     text = "\n".join([title, *(sheet.markdown() for sheet in sheets)])
     write_atomically(options.out / "evaluation.md", text.encode())
     write_atomically(options.out / "frames.csv", as_csv(records).encode())
     write_figure(options.out / "curves.png", draw_curves(records, filling, camera.in_words), dpi=110)
-    print(f"Written to {options.out}: evaluation.md, frames.csv, curves.png, frames-*.png")
+    console = Console(width=150)
+    with console.capture() as printed:
+        for sheet in (*sheets[:2], sheets[-1]):
+            console.print(sheet.rich())
+    print(printed.get() + f"Written to {options.out}: evaluation.md, frames.csv, curves.png, frames-*.png")
+
+
+def _note(sentence: str) -> None:
+    print(f"Note: {sentence}", file=sys.stderr)

@@ -17,6 +17,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from hsnoise._core.folders import alone_in, made
 from hsnoise._core.output import write_atomically
 from hsnoise.enhance.training import checkpoints, vgg
 from hsnoise.enhance.training.clips import check_sizes, crops, read_clips
@@ -36,10 +37,10 @@ MOST_SEED = 2**32 - 1
 
 
 def run(options: argparse.Namespace, console: Console) -> Path:
-    """Train, or resume training; returns the weights file.
+    """Train, or resume training, and tell progress on the console; returns the weights file.
 
     Raises:
-        ValueError: an option out of range, another run in the same folder, a loss that is not finite.
+        ValueError: an option out of range, another run in the same folder or at work in it, a loss that is not finite.
     """
     if not 0 <= options.seed <= MOST_SEED:
         raise ValueError(f"--seed: expected 0 to {MOST_SEED}, got {options.seed}")
@@ -51,9 +52,15 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     check_sizes([*train, *kept], preset.frames, preset.side)
     about = description(preset, camera, noise, train, kept, test, options) | {"vgg": vgg_digest}
     check_same_run(options.out, about)
+    with alone_in(options.out):
+        return trained(preset, camera, noise, perceptual, train, kept, about, options, console)
+
+
+def trained(preset: Preset, camera, noise, perceptual, train, kept, about: dict, options, console) -> Path:
+    """The run in its folder, from where an earlier one got to."""
     path = options.out / ENDED
     if has_ended(path, about):
-        console.print(f"Already finished: weights in {path}")
+        print(f"Already finished: weights in {path}")
         return path
     console.print(f"{len(train)} clips to train on, held out: {', '.join(clip.name for clip in kept)}")
     console.print(
@@ -74,7 +81,7 @@ def run(options: argparse.Namespace, console: Console) -> Path:
     if math.isnan(validation.last):  # nothing was left to train
         validation.measure(trainer.network(state), preset.steps)
     save_network(path, trainer.network(state), {**about, "psnr_db": validation.last})
-    console.print(f"Weights in {path}, log in {options.out / 'log.csv'}")
+    print(f"Weights in {path}, log in {options.out / 'log.csv'}")
     return path
 
 
@@ -202,7 +209,7 @@ def check_same_run(out: Path, about: dict) -> None:
     path = out / DESCRIBED
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out: expected a folder, but {out} is a file")
-    out.mkdir(parents=True, exist_ok=True)
+    made(out)
     if path.exists():
         try:
             before = dict(json.loads(path.read_text()))
