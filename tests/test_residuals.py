@@ -65,9 +65,11 @@ def test_a_frame_that_is_brighter_or_noisier_stands_out():
     assert measured.noise.argmax() == 4 and measured.noise[4] > 1.5 * max(one.noise.max() for one in drawn)
 
 
-def test_blocks_are_whole():
-    found = _blocks(np.arange(9 * 11, dtype=float).reshape(9, 11), 4)
-    assert found.shape == (2, 2) and found[0, 0] == np.median(np.arange(4) + 11 * np.arange(4)[:, None])
+def test_blocks_cover_all_pixels():
+    pixels = np.arange(9 * 11, dtype=float).reshape(9, 11)
+    found = _blocks(pixels, 4)
+    assert found.shape == (3, 3) and found[0, 0] == np.median(pixels[:4, :4])
+    assert found[2, 2] == np.median(pixels[8:, 8:]) and found[0, 2] == np.median(pixels[:4, 8:])
 
 
 def test_the_exposure_is_shown_where_it_stands_out_most():

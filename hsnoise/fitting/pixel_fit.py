@@ -16,7 +16,7 @@ import numpy as np
 
 from hsnoise.fitting.pixel_classes import classes_less
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
-from hsnoise.fitting.pixel_levels import growth_of_means, is_unlit, mean_black, subtracted
+from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_gain_of_darks, row_spectrum
@@ -191,6 +191,8 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     lines = lines_in(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
     warm = _warm(found, c) if narrow is None and not found.has_exposures else None
+    if pixels is not None:
+        black = black_of_pixels(pixels), black[1]
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
     if is_unlit(found, max(growth, values[2])) and (population is None or population.hot_fraction[0] <= 0):
         black = mean_black(found, c, warm, jumps), black[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.fitting.pixel_joint import UNKNOWN
+from hsnoise.statistics.pixels.classes import Levels, slope_over
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.population import Warm
 from hsnoise.statistics.pixels.survey import Plane, Survey
@@ -35,6 +36,17 @@ def growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[f
     shortest = int(t.argmin())
     black = float(level[shortest] - slope * t[shortest])
     return (slope, slope_error), (black, float(np.hypot(error[shortest], slope_error * t[shortest])))
+
+
+def black_of_pixels(pixels: Levels) -> float:
+    """Level without signal of the typical pixel, DN, extrapolated from the shortest exposure pixel by pixel.
+
+    In short exposures offsets and noise hide how skewed dark currents are, in long ones they do not, so that a line
+    through the medians of all pixels has the growth of no pixel.
+    """
+    t = pixels.exposure_s
+    shortest = int(t.argmin())
+    return float(np.median(pixels.level[shortest] - slope_over(t, pixels.level) * t[shortest]))
 
 
 def _line(exposure_s: np.ndarray, level_dn: np.ndarray, error_dn: np.ndarray) -> tuple[float, float]:

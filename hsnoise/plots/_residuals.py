@@ -88,9 +88,11 @@ def residuals(params: NoiseModel | FitResult, stack, *, seed: int = 0, **keyword
 
 
 def _blocks(pixels: np.ndarray, side: int) -> np.ndarray:
-    """Medians of whole blocks of side x side pixels [row, column]."""
-    rows, columns = (size // side for size in pixels.shape)
-    return np.median(pixels[: rows * side, : columns * side].reshape(rows, side, columns, side), axis=(1, 3))
+    """Medians of blocks of side x side pixels [row, column]; those at the ends may be smaller."""
+    short = [(0, -size % side) for size in pixels.shape]
+    whole = np.pad(pixels, short, constant_values=np.nan)
+    rows, columns = (size // side for size in whole.shape)
+    return np.nanmedian(whole.reshape(rows, side, columns, side), axis=(1, 3))
 
 
 def _maps(of: list[Apart]) -> list[tuple[np.ndarray, float]]:
@@ -150,6 +152,8 @@ def _map(figure: Figure, axes: Axes, shown: np.ndarray, chance: float, unit: str
     bar = figure.colorbar(image, ax=axes, location="bottom", extend=extend, shrink=0.8, aspect=40, format="%.3g")
     bar.set_label(f"measured - model / {unit} (rms {number(_rms(shown))}; by chance {number(chance)})", fontsize=9)
     bar.ax.tick_params(labelsize=9)
+    axes.set_xlim(column - 0.5, column + part.shape[1] - 0.5)  # the last blocks may be smaller
+    axes.set_ylim(row + part.shape[0] - 0.5, row - 0.5)
     axes.set_xlabel("column")
     axes.set_ylabel("row")
     axes.tick_params(labelsize=9)
