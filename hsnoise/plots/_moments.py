@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 
 from hsnoise._core.quadrature import normal_nodes
@@ -19,6 +20,12 @@ def beta_rule(sigma: float) -> tuple[np.ndarray, np.ndarray]:
     return 1 + sigma * z, weight
 
 
+def black_levels(model: NoiseModel, exposure_s) -> np.ndarray:
+    """Where counts without electrons lie, DN [exposure, channel]."""
+    with jax.enable_x64(True):  # the numbers of a fit are of double precision
+        return np.asarray(black_level_at(model, np.asarray(exposure_s)))
+
+
 def count_moments(model: NoiseModel, c: int, exposure_s, beta, white_level_dn: float | None):
     """Mean above black (DN) and variance (DN^2) of a pixel's count, [exposure, beta], for channel number `c`.
 
@@ -27,7 +34,7 @@ def count_moments(model: NoiseModel, c: int, exposure_s, beta, white_level_dn: f
     """
     gain = float(model["gain"].value[c]) * np.maximum(np.asarray(beta)[None, :], LEAST_BETA)
     mean_e = float(dark_current(model)) * np.asarray(exposure_s)[:, None]
-    black = black_level_at(model, np.asarray(exposure_s))[:, c, None]
+    black = black_levels(model, exposure_s)[:, c, None]
     mean, variance = clipped_moments(
         gain * mean_e,
         gain**2 * (mean_e + float(model["read_noise"].sigma) ** 2),

@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hsnoise.likelihood.darks import black_level_at, dark_current, flat_gain_of
+from hsnoise.likelihood.darks import dark_current, flat_gain_of
 from hsnoise.likelihood.flat_gain import FlatGain, local_gain, variance_curve
 from hsnoise.likelihood.flat_likelihood import ROUNDING_VARIANCE
 from hsnoise.likelihood.moments import binned_moments
 from hsnoise.likelihood.summary import RowHistograms, Summary, far_outliers
 from hsnoise.model import NoiseModel
-from hsnoise.plots._moments import beta_rule, count_moments
+from hsnoise.plots._moments import beta_rule, black_levels, count_moments
 from hsnoise.plots._pixel_transfer import draw_variances, transfers_of
 from hsnoise.plots._style import COLOURS, MARKERS, NAMES, new_figure, plain_log, tidy, title_of
 
@@ -87,7 +87,7 @@ def _darks(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     any_clipped = False
     for c, histograms in enumerate(summary.histograms):
         with jax.enable_x64(True):
-            channel, black = histograms.channel, np.asarray(black_level_at(model, summary.exposure_s))[:, c]
+            channel, black = histograms.channel, black_levels(model, summary.exposure_s)[:, c]
         colour = COLOURS[channel]
         mean, variance, error = _within_rows(histograms, far & ~_reaches_white(histograms, summary.white_level_dn))
         clipped = clipped_fraction(histograms, summary.white_level_dn) > CLIPPED_FRACTION

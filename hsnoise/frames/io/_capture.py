@@ -62,7 +62,8 @@ def read_capture(
             white_level = _shared(some, "white_level") if given is None else given
             levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
             about_levels += about
-            with _naming(root if len(read) > 1 else read[0].path):
+            files = {one.path for one in read}
+            with _naming(root if len(files) > 1 else files.pop()):
                 stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
             stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
