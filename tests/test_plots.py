@@ -228,10 +228,3 @@ def test_flats_alone_have_a_photon_transfer():
 def test_a_notebook_shows_a_figure_that_is_returned():
     figure = new_figure(3, 2, "title")
     assert figure._repr_png_().startswith(b"\x89PNG")
-
-
-def test_a_black_level_that_was_fitted_is_drawn_in_its_own_precision():
-    darks = [hsnoise.sample_dark(jax.random.key(7), 4, (48, 96), model(64.0), exposure_s=t) for t in EXPOSURES_S]
-    fit = hsnoise.fit(hsnoise.FrameStack(darks, EXPOSURES_S))
-    assert fit.params["black_level"].value.dtype == np.float64
-    assert plots.photon_transfer(fit).axes
