@@ -167,11 +167,11 @@ def test_the_network_is_scored_as_it_is_and_scaled():
 
 
 def test_weights_of_another_protocol_are_told(capsys):
-    for about, words in (({}, "white, not the average"), ({"protocol": "other"}, "'other'")):
+    for about, words in (({}, "trained by an unknown protocol"), ({"protocol": "another one"}, "by another one,")):
         evaluate.note_protocol(Path("weights.eqx"), about)
-        assert words in capsys.readouterr().out
+        assert words in capsys.readouterr().err
     evaluate.note_protocol(Path("weights.eqx"), {"protocol": evaluate.PROTOCOL})
-    assert not capsys.readouterr().out
+    assert capsys.readouterr() == ("", "")
 
 
 def clips_of(*names):
