@@ -254,7 +254,7 @@ def _show(
     """
     drawn = [args.out / figure]
     write_figure(drawn[0], found.plot())
-    if off is not None and max(n for n, kind in zip(stack.n_frames, stack.kind, strict=True) if kind == "dark") > 1:
+    if off is not None and stack.repeated_darks:
         from hsnoise import plots  # matplotlib is slow to import
 
         drawn.append(args.out / "residuals.png")

@@ -132,11 +132,10 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
 
 def repeated_darks(stack: FrameStack) -> FrameStack:
     """The dark exposures of two frames or more. Raises ValueError without any."""
-    chosen = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] > 1]
-    if not chosen:
+    if not stack.repeated_darks:
         raise ValueError("stack: expected two frames or more of a dark exposure, to tell what stays from what changes")
     most = max(FEWEST_FRAMES, MOST_COUNTS // (stack.shape[0] * stack.shape[1]))
-    return stack.select(exposures=chosen, frames=slice(0, most))
+    return stack.select(exposures=stack.repeated_darks, frames=slice(0, most))
 
 
 def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tuple[str, ...]) -> str:

@@ -187,7 +187,7 @@ def compare(
 def with_shares(found: Comparison, params: NoiseModel, portion: Portion, seed: int) -> Comparison:
     """A comparison with the shares of the noise budget that the model does not reproduce."""
     darks = portion.darks.frames
-    repeated = [i for i, frames in enumerate(darks.n_frames) if frames > 1]
+    repeated = darks.repeated_darks
     if not repeated:
         return found
     key, whole = key_for(seed, Purpose.SHARES), len(repeated) == darks.n_exposures

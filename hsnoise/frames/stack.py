@@ -151,6 +151,12 @@ class FrameStack:
         return tuple(int(counts.shape[0]) for counts in self.counts)
 
     @property
+    def repeated_darks(self) -> list[int]:
+        """The dark exposures of two frames or more, which tell what changes from what stays."""
+        kinds = zip(self.kind, self.n_frames, strict=True)
+        return [i for i, (kind, frames) in enumerate(kinds) if kind == "dark" and frames > 1]
+
+    @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of a frame in sensor orientation."""
         rows, columns = self.counts[0].shape[1:]

@@ -72,10 +72,9 @@ def residuals(params: NoiseModel | FitResult, stack, *, seed: int = 0, **keyword
     model = params.params if isinstance(params, FitResult) else params
     stack = as_stack(stack, **keywords)
     check_fits(model, stack)
-    repeated = [i for i, n in enumerate(stack.n_frames) if n > 1 and stack.kind[i] == "dark"]
-    if not repeated:
+    if not stack.repeated_darks:
         raise ValueError("stack: residuals need a dark exposure of two frames or more")
-    ends = {end(repeated, key=lambda i: stack.exposure_s[i]) for end in (min, max)}
+    ends = {end(stack.repeated_darks, key=lambda i: stack.exposure_s[i]) for end in (min, max)}
     part = Portion.of(stack.select(exposures=sorted(ends), frames=slice(0, MOST_FRAMES))).frames
     check_effects(model, part)
     side = max(4, 2 * round(max(part.shape) / BLOCKS / 2))

@@ -81,8 +81,7 @@ def render(
 
 def _where(comparison: Comparison | None, model: NoiseModel, stack: FrameStack, seed: int) -> dict[str, Figure]:
     """Where and when the frames differ from a model that does not fit; none if it does, or no dark is repeated."""
-    repeated = any(n > 1 for n, kind in zip(stack.n_frames, stack.kind, strict=True) if kind == "dark")
-    if comparison is None or comparison.fits or not repeated:
+    if comparison is None or comparison.fits or not stack.repeated_darks:
         return {}
     return {"where and when the frames differ from the model": residuals(model, stack, seed=seed + SEED_APART)}
 
