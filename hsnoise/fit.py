@@ -14,7 +14,8 @@ from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, co
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
 from hsnoise.fitting.notes import closing_notes, outlier_fraction
-from hsnoise.fitting.pixel_result import POPULATION, result_of
+from hsnoise.fitting.pixel_register import has_register
+from hsnoise.fitting.pixel_result import followed, result_of
 from hsnoise.fitting.problem import check_named
 from hsnoise.fitting.profile import profile_errors
 from hsnoise.fitting.result import FitResult, Method, Status
@@ -115,10 +116,10 @@ def fit(
     measurable = found is not None and (model is None or "black_clamp" not in model)
     differ = measurable and _is_conditional(found, method, pixels)
     seen = None
-    if measurable and not differ and pixels == "auto" and any(name in POPULATION for name in extra):
+    if measurable and not differ and pixels == "auto" and any(name in followed(found) for name in extra):
         seen = Evidence(found, _summary_of(source, progress))
         differ = carries_no_gain(seen, method)  # what single pixels tell is not to be simulated
-    simulated = tuple(name for name in extra if not (differ and name in POPULATION))
+    simulated = tuple(name for name in extra if not (differ and name in followed(found)))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
         return _ended(result if found is None else checked(result, Evidence(found, result.summary)))
@@ -234,8 +235,8 @@ def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
     """Whether the fit is conditional on the pixel."""
     if method == "transfer" or pixels == "differ":
         return True
-    needed = pixels_differ(found) or rows_dominate(found)
-    return method != "line" and pixels == "auto" and needed and can_be_transferred(found)
+    needed = (pixels_differ(found) or rows_dominate(found)) and can_be_transferred(found)
+    return method != "line" and pixels == "auto" and (needed or has_register(found))
 
 
 def _check_size(stack) -> None:

@@ -34,7 +34,8 @@ def closing_notes(result: FitResult) -> tuple[str, ...]:
 
 def pixel_notes(result: FitResult) -> tuple[str, ...]:
     """Notes under the table of a pixel-conditional fit, which has no histogram of pooled pixels."""
-    circumstances = (note(result) for note in (order_note, _warming_note, _light_note, _settings_note))
+    told = (order_note, _warming_note, _light_note, _settings_note, _multiplication_note)
+    circumstances = (note(result) for note in told)
     return (*parameter_notes(result), *chain.from_iterable(circumstances))
 
 
@@ -50,6 +51,18 @@ def _settings_note(result: FitResult) -> list[str]:
         )
     ]
     return [f"Besides the numbers of the table: {'; '.join(of)} (docs/effects.md)."] if of else []
+
+
+def _multiplication_note(result: FitResult) -> list[str]:
+    """What the numbers of a camera with a gain register refer to."""
+    if "electron_multiplication" not in result.added:
+        return []
+    error = result.table["electron_multiplication.excess"][1]
+    held = "" if error > 0 else " The excess noise is that of a large multiplication; flats would measure it."
+    return [
+        "This camera multiplies its electrons (EMCCD): the gain is that of an electron which enters the register, and"
+        f" read noise is in such electrons.{held}"
+    ]
 
 
 def parameter_notes(result: FitResult) -> list[str]:

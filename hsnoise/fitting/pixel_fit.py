@@ -19,6 +19,7 @@ from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
+from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_gain_of_darks, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -81,6 +82,7 @@ class Channel:
         subtracted: dark signal that the camera subtracts, DN/s, and its error; infinite if there is none.
         jumps: pixels that jump between levels; None if there are none.
         glow: what fades from one spot; None if nothing does. It is in none of the dark currents.
+        register: the gain register of an EMCCD; None without one.
     """
 
     name: str
@@ -102,6 +104,7 @@ class Channel:
     rays: Rays | None
     jumps: Jumps | None
     glow: Glow | None
+    register: Multiplied | None
     banding: tuple[str, Banding] | None
     subtracted: tuple[float, float]
 
@@ -159,21 +162,24 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
 
 def _channel(found: Survey, c: int, name: str) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
-    narrow = _narrow(found, c)
-    jumps, jumping = jumps_of(found, c) if narrow is None else (None, None)
-    tail = tail_of(found, c) if narrow is None and jumps is None else None
+    narrow, register = _narrow(found, c), multiplied_of(found)
+    is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
+    jumps, jumping = jumps_of(found, c) if is_plain else (None, None)
+    tail = tail_of(found, c) if is_plain and jumps is None else None
     raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
     floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
-    # Rounding, not light, sets the variance of narrow noise.
-    pixels = levels_of(found, c, without=jumping) if narrow is None else None
+    pixels = levels_of(found, c, without=jumping) if is_plain else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     banding = banding_in(found, c)
     row_gain = partial(row_gain_of_darks, found, c, spectrum, banding)
-    rays = _rays(found, c) if narrow is None else None
+    rays = _rays(found, c) if is_plain else None
     at_rest = np.array([1.0, floor, growth]), np.diag([UNKNOWN, floor_error, growth_error]) ** 2
     if tail is not None:
         _raise(*at_rest, tail)
     (values, covariance), transfer, population, glow = at_rest, None, None, None
+    if register is not None:
+        values, errors = np.array([register.gain, register.read_dn2, register.growth]).T
+        covariance, floor = np.diag(np.minimum(errors, UNKNOWN) ** 2), register.read_dn2[0]
     if pixels is not None:
         transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
     if transfer is not None and pixels is not None:
@@ -190,12 +196,14 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
     shading = shadings_of(found, c, spectrum.widened)
     lines = lines_in(found, c, shading)
     offset = population.offset_sigma if population is not None else _offset(found, c)
-    warm = _warm(found, c) if narrow is None and not found.has_exposures else None
+    warm = _warm(found, c) if is_plain and not found.has_exposures else None
     if pixels is not None:
         black = black_of_pixels(pixels), black[1]
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
     if is_unlit(found, max(growth, values[2])) and (population is None or population.hot_fraction[0] <= 0):
         black = mean_black(found, c, warm, jumps), black[1]
+    if register is not None:
+        black = register.black_dn
     return Channel(
         name=name,
         transfer=transfer,
@@ -210,12 +218,13 @@ def _channel(found: Survey, c: int, name: str) -> Channel:
         temporal_dn2=floor,
         shading=shading,
         row_spectrum=spectrum,
-        noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if narrow is None else UNKNOWN_SPREAD,
+        noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if is_plain else UNKNOWN_SPREAD,
         photo_response=_photo_response(found, c, black[0], offset[0]),
         warm=warm,
         rays=rays,
         jumps=jumps,
         glow=glow,
+        register=register,
         banding=banding,
         subtracted=subtracted(transfer, (growth, growth_error)),
     )
@@ -381,8 +390,10 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer, of_gl
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:
     """The channel with the gain and row gain of its flats; the transfer of its darks remains as a check."""
     values, covariance = one.values.copy(), one.covariance.copy()
-    values[0] = flats.gain[c]
+    register = None if one.register is None else with_flats(one.register, flats)
+    gain = (flats.gain[c], flats.standard_error[c]) if register is None else register.gain
+    values[0] = gain[0]
     covariance[0], covariance[:, 0] = 0.0, 0.0
-    covariance[0, 0] = flats.standard_error[c] ** 2
+    covariance[0, 0] = gain[1] ** 2
     rows = row_gain_of(moments, flats.signal_dn[:, c], c)
-    return replace(one, values=values, covariance=covariance, row_gain=rows)
+    return replace(one, values=values, covariance=covariance, row_gain=rows, register=register)

@@ -20,6 +20,7 @@ from hsnoise.effects import (
     CosmicRays,
     DarkCurrentNonuniformity,
     DarkSignalNonuniformity,
+    ElectronMultiplication,
     FrameOffset,
     HotPixels,
     MissingCodes,
@@ -38,6 +39,7 @@ from hsnoise.effects import (
 from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_colours, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
+from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
@@ -45,6 +47,7 @@ from hsnoise.likelihood.parameters import numbers_of
 from hsnoise.likelihood.summary import Summary
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.shading import Shading
+from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING
 
 NOMINAL = 50.0  # relative standard error of an unknown gain
@@ -77,11 +80,16 @@ OF_PIXELS = (
     BlackClamp,
     AmplifierGlow,
     MissingCodes,
+    ElectronMultiplication,
 )
-POPULATION = tuple(effect.name for effect in OF_PIXELS)  # what a pixel-conditional fit measures beyond the paper
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
+
+
+def followed(found: Survey) -> set[str]:
+    """Names of the effects beyond the paper's that a fit of these frames measures when it follows each pixel."""
+    return {effect.name for effect in OF_PIXELS if effect is not ElectronMultiplication or has_register(found)}
 
 
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
@@ -130,6 +138,8 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
 
 
 def _detail(pixel: PixelFit) -> str:
+    if pixel.channels[0].register is not None:
+        return "gain from single electrons that a register multiplied" + (" and the flats" if pixel.flats else "")
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
     if pixel.flats is not None and pixel.determined:
         return "gain from the flats, read noise from each pixel over time"
@@ -174,6 +184,8 @@ def _population(
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}
     found |= {**_noise_spread(pixel), **rays_of(pixel, gain), **jumps_of(pixel, gain), **of_glow(pixel.channels, gain)}
+    if (register := pixel.channels[0].register) is not None:
+        found |= effects_of(register)
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
     response = of_colours([c.photo_response for c in pixel.channels])

@@ -315,9 +315,10 @@ def _of_codes(found: Survey) -> Iterator[str]:
 
 
 def _has_noisy_pixels(result: FitResult) -> bool:
-    """Whether an effect of the model draws pixels that are far noisier than others."""
+    """Whether an effect of the model draws pixels that are far noisier than others, always or in a frame."""
     of = result.params["read_noise_nonuniformity"] if "read_noise_nonuniformity" in result.params else None
-    return "random_telegraph_noise" in result.params or (of is not None and float(of.tail) > 0)
+    by_name = {"random_telegraph_noise", "electron_multiplication"} & set(result.params.names)
+    return bool(by_name) or (of is not None and float(of.tail) > 0)
 
 
 def _outliers(result: FitResult) -> Iterator[str]:

@@ -15,6 +15,7 @@ from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouri
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
+from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 
@@ -72,6 +73,7 @@ class Group:
 
     along: what pixels share of their temporal noise along rows; None if the frames do not show it.
     row_groups: rows that are read together; looked for in the shortest repeated darks, None if they do not show any.
+    register: of an EMCCD, of darks that show one.
     files: names of the frames' files; empty for arrays.
     """
 
@@ -84,6 +86,7 @@ class Group:
     planes: tuple[Plane, ...]
     along: Along | None
     row_groups: RowGroups | None
+    register: Register | None
     files: tuple[str, ...]
 
     def of(self, channel: int) -> list[Plane]:
@@ -231,6 +234,7 @@ def _group(
     of_frames = (
         along_rows(kept, step, rows),
         groups,
+        register_of(kept) if step == 1 and stack.kind[i] == "dark" else None,
         tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
     )
     of_codes = int(np.gcd.reduce(kept[0].ravel()[:: max(1, kept[0].size // MOST_CODES)].astype(np.int64)))

@@ -1,0 +1,153 @@
+"""The gain register of an EMCCD in a fit that follows each pixel: what single electrons tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import gamma, poisson
+
+from hsnoise.likelihood.flat_gain import FlatGain
+from hsnoise.statistics.pixels.register import FEWEST_FRAMES, LEAST_ELECTRONS, register_of_exposures
+from hsnoise.statistics.pixels.survey import Group, Survey
+
+MULTIPLIED = 1.0  # excess noise factor less 1 of a register of large gain
+LESS = 3.0  # standard errors by which flats must show less
+WELL_KNOWN = 0.1  # error of the excess
+CHANCE, HIGH = 1e-3, 4.0  # of a pixel to have so many electrons, and multiplied so far; deviations of its read noise
+FEWEST_HOT = 5
+SPREAD_THERE = 5.0  # standard errors
+
+Number = tuple[float, float]
+
+
+class Pixels(NamedTuple):
+    """Of one exposure, s: share of hot pixels and their mean extra level, DN (0: none); relative standard deviation of
+    the level of the others."""
+
+    exposure_s: float
+    hot: Number
+    extra_dn: Number
+    spread: Number
+
+
+@dataclass(frozen=True)
+class Multiplied:
+    """A gain register as `electron_multiplication` has it.
+
+    Attributes:
+        gain: DN for each electron that enters; read_dn2: variance without electrons, rounding included, DN^2.
+        growth: DN/s, and clocks: electrons whatever the exposure.
+        black_dn: level without electrons.
+        excess: excess noise factor less 1; its error is infinite if that of a large gain is taken.
+        pixels: how the pixels' dark currents differ.
+    """
+
+    gain: Number
+    read_dn2: Number
+    growth: Number
+    clocks: Number
+    black_dn: Number
+    pixels: Pixels
+    excess: Number = (MULTIPLIED, np.inf)
+
+
+def has_register(found: Survey) -> bool:
+    """Whether darks show a gain register."""
+    return any(group.register is not None for group in found.darks)
+
+
+def multiplied_of(found: Survey) -> Multiplied | None:
+    """The register of all darks; None without one."""
+    several = [(group.exposure_s, group.register) for group in found.darks if group.register is not None]
+    if not several:
+        return None
+    # Exposures that are too short to show any electrons have hardly any.
+    without = [g.exposure_s for g in found.darks if g.register is None and g.n_frames >= FEWEST_FRAMES]
+    step, noise, rate, clocks = register_of_exposures(several, [(t, (0.0, LEAST_ELECTRONS)) for t in without])
+    shortest = found.shortest
+    entered = clocks[0] + rate[0] * shortest.exposure_s
+    level = float(np.mean([p.row_mean_dn.mean() for p in shortest.of(0)]))
+    off = np.hypot(step[0] * np.hypot(clocks[1], rate[1] * shortest.exposure_s if rate[0] else 0.0), entered * step[1])
+    lines_dn2 = _of_lines(shortest)
+    return Multiplied(
+        gain=step,
+        read_dn2=(max(noise[0] ** 2 - lines_dn2, 0.0), 2 * noise[0] * noise[1]),
+        growth=(step[0] * rate[0], step[0] * rate[1]),
+        clocks=clocks,
+        black_dn=(level - step[0] * entered, float(np.hypot(shortest.level_error_dn(0), off))),
+        pixels=_pixels(found, step[0], noise[0], clocks[0], rate[0]),
+    )
+
+
+def _pixels(found: Survey, step: float, noise: float, clocks: float, rate: float) -> Pixels:
+    """How pixels differ at the longest exposure that shows it, from halves of its frames, whose chance is their own."""
+    longest = max(found.repeated_darks, key=lambda group: group.exposure_s)
+    frames, t = longest.n_frames, longest.exposure_s
+    halves = longest.pixels(0, "level_dn").astype(np.float64)
+    mean = clocks + rate * t
+    most = poisson.isf(CHANCE, mean * frames) if mean > 0 else 0
+    limit = (step * gamma.isf(CHANCE, max(most, 1)) + HIGH * noise * np.sqrt(frames)) / frames - step * mean
+    is_hot = np.zeros(halves.shape[1], bool)
+    for _ in range(2):  # hot pixels raise the mean from which they are told
+        off = halves - np.mean(halves[:, ~is_hot], axis=1, keepdims=True)
+        level = off.mean(0)
+        is_hot = level > limit
+    hot, extra = (0.0, np.inf), (0.0, np.inf)
+    if is_hot.sum() > FEWEST_HOT:
+        # Exponential charges exceed any limit by their mean.
+        beyond, number = float((level[is_hot] - limit).mean()), float(is_hot.sum())
+        share = number / level.size * np.exp(limit / beyond)
+        hot = float(share), float(share * np.sqrt(1 + (limit / beyond) ** 2) / np.sqrt(number))
+        extra = beyond, beyond / float(np.sqrt(number))
+    return Pixels(t, hot, extra, _spread(found, off[:, ~is_hot], is_hot, step * rate * t))
+
+
+def _spread(found: Survey, off: np.ndarray, is_hot: np.ndarray, dark_dn: float) -> Number:
+    """Relative standard deviation over pixels of a dark level, DN, beside that of their offsets."""
+    offsets = found.shortest.pixels(0, "level_dn")[:, ~is_hot]
+    offsets, off = (one - one.mean(1, keepdims=True) for one in (offsets, off))
+    products = off[0] * off[1] - offsets[0] * offsets[1] * found.has_exposures
+    if dark_dn <= 0:
+        return 0.0, np.inf
+    variance, error = float(products.mean()), float(products.std() / np.sqrt(products.size))
+    if not found.has_exposures or variance < SPREAD_THERE * error:
+        return 0.0, np.inf
+    spread = float(np.sqrt(variance)) / dark_dn
+    return spread, spread * error / variance / 2
+
+
+def _of_lines(group: Group) -> float:
+    """Variance that rows and columns share in a frame, DN^2."""
+    components = group.planes[0].components
+    return sum(max(components[name].variance_dn2, 0.0) for name in ("row_x_frame", "column_x_frame"))
+
+
+def with_flats(register: Multiplied, flats: FlatGain) -> Multiplied:
+    """The register with what flats say of it: their variance over signal is the gain times the excess noise factor."""
+    ratio = flats.gain[0] / register.gain[0]
+    error = float(ratio * np.hypot(flats.standard_error[0] / flats.gain[0], register.gain[1] / register.gain[0]))
+    excess = float(ratio - 1)
+    if error < WELL_KNOWN and excess < MULTIPLIED - LESS * error:
+        return replace(register, excess=(max(excess, 0.0), error))
+    values = np.array([register.gain[0], flats.gain[0] / (1 + MULTIPLIED)])
+    errors = np.array([register.gain[1], flats.standard_error[0] / (1 + MULTIPLIED)])
+    weight = errors**-2.0
+    gain_dn = float(weight @ values / weight.sum())
+    apart = max(abs(float(values[1] - values[0])) / float(np.hypot(*errors)), 1.0)
+    return replace(register, gain=(gain_dn, float(weight.sum() ** -0.5) * apart))
+
+
+def effects_of(register: Multiplied) -> dict[str, dict[str, Number]]:
+    """The effects of the register and of the pixels before it, by name: their fields with errors."""
+    found = {"electron_multiplication": {"excess": register.excess, "clock_induced": register.clocks}}
+    t, hot, extra, spread = register.pixels
+    if hot[0] > 0:
+        charge = extra[0] / register.gain[0], extra[1] / register.gain[0]
+        rate, at_readout = ((charge[0] / t, charge[1] / t), (0.0, np.inf)) if t > 0 else ((0.0, np.inf), charge)
+        found["hot_pixels"] = {"fraction": hot, "rate": rate, "at_readout": at_readout}
+    if spread[0] > 0:
+        log_spread = float(np.sqrt(np.log1p(spread[0] ** 2)))
+        found["dark_current_nonuniformity"] = {"spread": (log_spread, spread[1])}
+    return found
