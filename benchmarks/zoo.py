@@ -47,6 +47,7 @@ class Sensor:
     coupling: Frames | None = None
     each_frame: Callable[[], Any] = lambda: 0.0
     exposed: Callable[[float], Any] = lambda seconds: 0.0
+    multiplies: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
     def normal(self, *shape: int) -> Frames:
@@ -58,6 +59,8 @@ class Sensor:
     def _frame(self, seconds: float, light: float) -> Frames:
         mean = np.broadcast_to(self.dark * seconds + self.response * light, self.shape)
         electrons = self.rng.poisson(mean) + self.exposed(seconds)
+        if self.multiplies:
+            electrons = np.where(electrons > 0, self.rng.gamma(np.maximum(electrons, 1)), 0.0)
         if self.coupling is not None:
             electrons = convolve(electrons.astype(float), self.coupling)
         dn = self.gain * (electrons + self.read * self.normal()) + self.offset_dn + self.each_frame()
@@ -238,6 +241,23 @@ def two_banks(rng):
     return sensor, sensor.stack({0.1: 16, 10.0: 16, 60.0: 16})
 
 
+def emccd(rng, lights: dict[float, int] | None = None):
+    """512 stages that multiply by 300, 5 e-/DN behind them; clocks add an electron to one pixel of a hundred."""
+    shape = (200, 300)
+    sensor = Sensor(
+        rng, shape, gain=60.0, read=0.17, multiplies=True, dark=_warm(np.full(shape, 0.003), 0.003, 0.3, rng)
+    )
+    sensor.dark = _warm(0.003 * rng.lognormal(-0.02, 0.2, shape), 0.003, 0.3, rng)
+    sensor.offset_dn = 200 + 0.7 * sensor.normal() + sensor.normal(1, 300)
+    sensor.exposed = lambda seconds: rng.poisson(0.01, shape)
+    sensor.each_frame = lambda: 0.5 * rng.standard_normal()
+    return sensor, sensor.stack({0.05: 20, 30.0: 12} if lights is None else {0.05: 20}, lights, 0.05)
+
+
+def emccd_with_flats(rng):
+    return emccd(rng, {5.0: 4, 30.0: 4, 100.0: 4})
+
+
 def _warm(dark: Frames, share: float, mean: float, rng) -> Frames:
     """Dark currents, some pixels hot, e-/s."""
     return dark + (rng.random(dark.shape) < share) * rng.exponential(mean, dark.shape)
@@ -271,6 +291,8 @@ KINDS: dict[str, Callable] = {
     "three frames": few_frames,
     "eight bits": eight_bits,
     "even and odd columns": two_banks,
+    "EMCCD, darks": emccd,
+    "EMCCD, bias and flats": emccd_with_flats,
 }
 
 

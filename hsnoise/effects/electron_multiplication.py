@@ -32,6 +32,7 @@ class ElectronMultiplication(AbstractEffect):
     In dark frames: a tail towards bright pixels, because single electrons, of dark current or of the clocks, scatter
     exponentially. The variance alone shows no more than a gain F^2 times as large, in darks and flats alike; only the
     shape of the distribution separates the two: the third moment is 3/2 of what such a gain makes of Poisson numbers.
+    Fits that follow each pixel measure it where single electrons stand out of the read noise.
 
     References: Robbins, Hadwen, "The noise performance of electron multiplying charge-coupled devices", IEEE Trans.
     Electron Devices 50, 2003; Basden, Haniff, Mackay, "Photon counting strategies with low-light-level CCDs", MNRAS

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize, nnls
-from scipy.stats import poisson
 
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, MOST_OF_SPREAD
 
@@ -15,12 +14,13 @@ FAR = 6.0  # deviations beyond which a change is no read noise
 LEAST_FAR = 2e-4  # share of such changes from which a register is looked for
 EVEN = 0.8  # of the pixels that would have such changes if chance spread them; defects gather in few
 DOWNWARD = 0.1  # of the far changes: telegraph noise jumps both ways
-UNLIKELY = 1e-5  # of a pixel to have so many by chance; those with more are hot
+LEFT_OUT = 0.01  # of the pixels: those that may be hot
 LEAST_ELECTRONS, LEAST_STEP = 5e-4, 2.5  # a pixel and frame; multiplied electron over read noise
 MOST_OFF = 0.2  # of the far changes that the exponential leaves unexplained
 LEAST_KNOWN = 0.25  # relative error of the step
 CODES_A_DEVIATION = 4  # of the histogram
 FEWEST_IN_BIN = 20.0
+SINGULAR = 1e10  # condition of the information of the logarithms
 FINELY = {"xatol": 1e-5, "fatol": 1e-12}
 
 
@@ -61,12 +61,12 @@ def register_of(counts: np.ndarray) -> Register | None:
     sigma, far = _far(changes)
     if far.mean() < LEAST_FAR:
         return None
-    in_pixel = far.sum(0)
-    if not _is_even(in_pixel) or not _is_upward(counts, sigma / np.sqrt(2)):
+    if not _is_even(far.sum(0)) or not _is_upward(counts, sigma / np.sqrt(2)):
         return None
-    expected = -np.log(max(float((in_pixel == 0).mean()), 1.0 / in_pixel.size))
-    cool = in_pixel <= max(poisson.isf(UNLIKELY, expected), 1)
-    return _fitted(np.abs(changes[:, cool]), sigma / np.sqrt(2))
+    half = len(changes) // 2
+    # Without hot pixels, which other frames tell: chance in these does not choose.
+    cool = [changes[of][:, _is_cool(counts[other])] for of, other in _crosswise(half)]
+    return _fitted(np.abs(np.concatenate([one.ravel() for one in cool])), sigma / np.sqrt(2))
 
 
 def register_of_exposures(
@@ -125,6 +125,17 @@ def _is_even(in_pixel: np.ndarray) -> bool:
     return bool((in_pixel > 0).mean() > EVEN * -np.expm1(-in_pixel.mean()))
 
 
+def _crosswise(half: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """The first pairs with the frames of the others, and the others with those of the first."""
+    return (slice(half), slice(2 * half, None)), (slice(half, None), slice(2 * half))
+
+
+def _is_cool(counts: np.ndarray) -> np.ndarray:
+    """Pixels that are not among the brightest, on average over frames [frame, row, column]."""
+    level = counts.mean(0, dtype=np.float64).ravel()
+    return level <= np.quantile(level, 1 - LEFT_OUT)
+
+
 def _is_upward(counts: np.ndarray, sigma: float) -> bool:
     """Whether counts are far above the median of their pixel, and hardly ever far below."""
     off = counts - np.median(counts, axis=0).astype(np.float32)
@@ -150,7 +161,10 @@ def _fitted(sizes: np.ndarray, sigma: float) -> Register | None:
     best = minimize(lambda theta: -found @ log_shares(theta) / found.sum(), start, method="Nelder-Mead", options=FINELY)
     shares = np.exp(log_shares(best.x))
     slopes = np.stack([(log_shares(best.x + h) - log_shares(best.x - h)) / 2e-4 for h in 1e-4 * np.eye(3)], 1)
-    covariance = np.linalg.inv(found.sum() * (slopes.T * shares) @ slopes)
+    information = found.sum() * (slopes.T * shares) @ slopes
+    if not np.linalg.cond(information) < SINGULAR:
+        return None
+    covariance = np.linalg.inv(information)
     expected = found.sum() * shares
     off, far = found - expected, np.arange(length // 2) * width > FAR * np.sqrt(2) * np.exp(best.x[1])
     told = expected > FEWEST_IN_BIN
