@@ -70,6 +70,15 @@ def test_without_weights_those_that_come_with_hsnoise_are_taken(place, capsys):
     assert np.stack(list(frames_of(place / "shipped.mp4"))).shape == FRAMES.shape
 
 
+def test_a_built_in_camera_has_its_own_weights(place, capsys, monkeypatch):
+    monkeypatch.setattr("hsnoise.cli.enhance.enhance", lambda net, frames, tile: iter([]))
+    model = hsnoise.cameras.grasshopper3()
+    counts = np.asarray(hsnoise.sample(0, np.full((2, 16, 24), 2.0, np.float32), model))
+    np.savez(place / "g.npz", counts=counts[None], exposure_s=[0.03], cfa=model.cfa)
+    main(["enhance", str(place / "g.npz"), str(place / "g.mp4"), "--camera", "grasshopper3"])
+    assert "trained for grasshopper3, scenes that average 0.68 to 2" in capsys.readouterr().err
+
+
 def test_raw_frames_keep_their_own_exposure_and_colours(place, seen):
     """A model is fitted to darks of other exposures, and perhaps to a region with another first pixel."""
     model = hsnoise.cameras.canon_5d3(black_level_dn=64).with_value("dark_current", "rate", 100.0)

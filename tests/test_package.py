@@ -112,6 +112,7 @@ def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
     assert {
         "hsnoise/py.typed",
         "hsnoise/enhance/data/enhancer_canon_5d3.eqx",
+        "hsnoise/enhance/data/enhancer_grasshopper3.eqx",
         "hsnoise/frames/data/st8/README.txt",
     } <= package
     assert len([name for name in package if name.endswith(".fits.fz")]) == 18
@@ -150,7 +151,7 @@ from pathlib import Path
 import hsnoise
 from hsnoise.enhance.weights import SHIPPED, load_network
 folder = Path(hsnoise.__file__).parent
-assert (folder / "py.typed").exists() and load_network(SHIPPED)
+assert (folder / "py.typed").exists() and all(map(load_network, SHIPPED.values()))
 print(folder, hsnoise.__version__)
 """
     folder, version = run(installed / "python", "-c", code, cwd=tmp_path).split()

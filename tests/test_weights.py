@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from hsnoise.enhance.weights import SHIPPED, load_network, read_arrays, save_network, write_arrays
+from hsnoise.enhance.weights import FOR_OTHERS, SHIPPED, load_network, read_arrays, save_network, write_arrays
 from hsnoise.stlstm import STLSTM
 
 
@@ -102,6 +102,7 @@ def test_weights_that_are_not_finite_are_told(tmp_path):
         load_network(path)
 
 
-def test_the_weights_that_come_with_hsnoise_are_read():
-    net, about = load_network(SHIPPED)
-    assert net.channels == 3 and about["camera"] == "canon_5d3"
+@pytest.mark.parametrize("camera", SHIPPED)
+def test_the_weights_that_come_with_hsnoise_are_read(camera):
+    net, about = load_network(SHIPPED[camera])
+    assert net.channels == 3 and about["camera"] == camera and FOR_OTHERS in SHIPPED

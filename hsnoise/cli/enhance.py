@@ -22,7 +22,7 @@ from hsnoise.chain.photometry import GREY, frames_of_display, light_of_frames
 from hsnoise.effects import BlackLevel
 from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.video import VIDEO, WRITTEN, frame_rate_of, frames_of, write_video
-from hsnoise.enhance.weights import SHIPPED, load_network
+from hsnoise.enhance.weights import FOR_OTHERS, SHIPPED, load_network
 from hsnoise.frames.io.load import load
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -36,7 +36,7 @@ BLOCK = 8  # pixels; most of a picture is uniform within a block
 def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     """camera: of raw frames; None for a video of display values."""
     _check(args)
-    net, about = load_network(args.weights or SHIPPED)
+    net, about = load_network(args.weights or SHIPPED.get(args.camera, SHIPPED[FOR_OTHERS]))
     if args.weights is None:
         print(
             f"Using the weights that come with hsnoise, trained for {about['camera']}, {_light_in_words(about)};"

@@ -250,7 +250,7 @@ def _enhance_arguments(commands: Any) -> None:
         "--weights",
         type=Path,
         metavar="FILE",
-        help="weights.eqx of a training run (default: the shipped ones, for a Canon 5D Mark III at ISO 25600)",
+        help="weights.eqx of a training (default: shipped ones, of grasshopper3 for that --camera, else canon_5d3)",
     )
     enhance.add_argument("--camera", help=f"model.json of the camera of raw frames, or {', '.join(CAMERAS)}")
     enhance.add_argument(

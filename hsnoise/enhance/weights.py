@@ -21,7 +21,10 @@ from hsnoise._core.output import write_atomically
 from hsnoise.stlstm import STLSTM
 
 FORMAT = "hsnoise arrays 2"
-SHIPPED = Path(__file__).parent / "data" / "enhancer_canon_5d3.eqx"  # described by the .txt file beside it
+SHIPPED = {  # each described by the .txt file beside it
+    camera: Path(__file__).parent / "data" / f"enhancer_{camera}.eqx" for camera in ("canon_5d3", "grasshopper3")
+}
+FOR_OTHERS = "canon_5d3"  # the shipped weights for cameras that are not built in
 
 
 def write_arrays(path: str | os.PathLike, tree: Any, about: Mapping[str, Any]) -> None:
