@@ -101,7 +101,8 @@ def diagnosed(
     added = fit.added if isinstance(fit, FitResult) else ()
     if 0 < len(added) <= FEW:
         found = _diagnosed(fit.without(added), portion, candidates, draws, seed, tick)
-        if found.best is not None and found.best.name in added:
+        of_others = found.verdict == Verdict.NAMED and not set(found.names) <= set(added)
+        if found.best is not None and found.best.name in added and not of_others:
             return found
     return _diagnosed(fit, portion, candidates, draws, seed, tick)
 
