@@ -201,3 +201,5 @@ ROWS = [
     Row("two identical frames", identical_frames, None, rf"identical.*\b1\b.*\b{ODD}\b|\b1\b.*\b{ODD}\b.*identical"),
     Row("a masterdark among darks", masterdark, None, FRAME),
 ]
+# Contaminations that are effects of the library, by which fits measure them.
+MEASURED = {"cosmic rays": "cosmic_rays", "hot pixels": "hot_pixels", "telegraph pixels": "random_telegraph_noise"}

@@ -58,6 +58,17 @@ def test_columns_are_measured_beside_a_drift(curve, pattern_e):
     assert found.conclusion.light == Light.GREEN and not told(found.doubts, "curve")
 
 
+@pytest.mark.parametrize("curve", ["none", pytest.param("drift", marks=pytest.mark.slow)])
+def test_stuck_pixels_are_no_pattern_and_hide_no_drift(curve):
+    counts = darks(curve, 0.0)
+    stuck = np.random.default_rng(3).choice(COLUMN.size * SHAPE[0], 16, replace=False)
+    stuck[0] = 0  # in the first column, as a steep drift would be
+    counts.reshape(*counts.shape[:2], -1)[..., stuck] = 4095
+    found = hsnoise.fit(counts, exposure_s=EXPOSURES_S)
+    assert {"row_fixed_pattern", "column_fixed_pattern"}.isdisjoint(found.added)
+    assert ("black_shading" in found.added) == (curve != "none")
+
+
 @pytest.mark.parametrize(
     "curve", ["two drifts", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("step", "parabola"))]
 )

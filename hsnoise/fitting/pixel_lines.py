@@ -62,15 +62,9 @@ def _rest(means_dn: np.ndarray, shading: Shading | None) -> np.ndarray:
 
 
 def _noise_dn2(plane: Plane, axis: str, frames: int) -> float:
-    """What pixels, static and over time, and lines over time scatter the static mean of a line, DN^2."""
-    over_time = max(plane.components[f"{axis}_x_frame"].variance_dn2, 0.0)
-    return sum(of_pixels_dn2(plane, axis)) + over_time / frames
+    """What pixels, static and over time, and lines over time scatter the static mean of a line, DN^2.
 
-
-def of_pixels_dn2(plane: Plane, axis: str) -> tuple[float, float]:
-    """What typical static pixels scatter the mean of a line, DN^2, and what outlying ones, as hot or stuck, add to it.
-
-    Lines that few of these pull far off are defects, which others leave out, too.
+    Outlying pixels, hot or stuck, do so in all lines but those few that they pull far off, which are left out.
     """
     level = plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
     level -= np.median(level, axis=0)
@@ -78,9 +72,9 @@ def of_pixels_dn2(plane: Plane, axis: str) -> tuple[float, float]:
     across = plane.row_mean_dn if axis == "column" else plane.column_mean_dn
     lines = level if axis == "row" else level.T
     pulled = lines.mean(1)
-    near = _near(pulled - np.median(pulled))
-    typical, whole = _typical_dn(level) ** 2, float(lines[near].var(1).mean())
-    return typical / len(across), max(whole - typical, 0.0) / len(across)
+    of_pixels = max(_typical_dn(level) ** 2, float(lines[_near(pulled - np.median(pulled))].var(1).mean()))
+    over_time = max(plane.components[f"{axis}_x_frame"].variance_dn2, 0.0)
+    return of_pixels / len(across) + over_time / frames
 
 
 def _typical_dn(values: np.ndarray) -> float:

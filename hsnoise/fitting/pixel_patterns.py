@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hsnoise.fitting.pixel_lines import Lines, lines_of, of_pixels_dn2
+from hsnoise.fitting.pixel_lines import Lines, lines_of
 from hsnoise.statistics.decomposition import mean_of
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.shading import Shading, shading_of
@@ -59,8 +59,7 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
     planes, out = shortest_of(found, c), {}
     for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
         if planes:
-            outlying_dn2 = of_pixels_dn2(planes[0], axis)[1]
-            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size + outlying_dn2)
+            noise = np.sqrt(planes[0].components["temporal"].variance_dn2 / planes[0].row_mean_dn.size)
             means = np.mean([getattr(p, name) for p in planes], axis=0)
             of_lines_dn2 = mean_of([p.components[f"{axis}_x_frame"] for p in planes]).variance_dn2
             # In the shape of a shading: all of it, if a few slow waves make the noise.

@@ -33,22 +33,46 @@ def shading_of(means_dn: np.ndarray, noise_dn: float, chance_dn: float = 0.0) ->
     """The shading of static row or column means [n], DN; None if it explains too little of them.
 
     noise_dn: standard error of each mean; chance_dn: rms of a shading that noise of lines makes in these means.
+    A defect of the first or last line looks like a steep drift, but alone it is none.
     """
+    found = _steepest(means_dn, noise_dn, chance_dn)
+    if found is None or _holds_without_edge(found, means_dn):
+        return found
+    means_dn = _without_edge(means_dn, found.start)
+    found = _steepest(means_dn, noise_dn, chance_dn)
+    return found if found is not None and _holds_without_edge(found, means_dn) else None
+
+
+def _steepest(means_dn: np.ndarray, noise_dn: float, chance_dn: float) -> Shading | None:
+    """The shading of means [n], that of a defect at the edge included."""
     y = _without_defects(means_dn)
-    y -= y.mean()
     best = None
     for start in ("first", "last"):
         for length in LENGTHS:
-            size = float((_shape(len(y), start, length) * y).mean())
+            size = _size(y, start, length)
             if best is None or abs(size) > abs(best[0]):
                 best = size, length, start
     assert best is not None
     size, length, start = best
-    left = max(float((y**2).mean()) - size**2, 0.0)
+    left = max(float(y.var()) - size**2, 0.0)
     error = float(np.sqrt((left + noise_dn**2) / len(y) + chance_dn**2))
-    if abs(size) < THERE * error or size**2 < LEAST_SHARE * float((y**2).mean()):
+    if abs(size) < THERE * error or size**2 < LEAST_SHARE * float(y.var()):
         return None
     return Shading(abs(size), error, length, start, size > 0)
+
+
+def _holds_without_edge(found: Shading, means_dn: np.ndarray) -> bool:
+    rest = _without_defects(_without_edge(means_dn, found.start))
+    return abs(_size(rest, found.start, found.length)) >= THERE * found.error_dn
+
+
+def _without_edge(means_dn: np.ndarray, start: str) -> np.ndarray:
+    """Means of lines, the first or last replaced by the next."""
+    return np.append(means_dn[1], means_dn[1:]) if start == "first" else np.append(means_dn[:-1], means_dn[-2])
+
+
+def _size(means_dn: np.ndarray, start: str, length: float) -> float:
+    return float((_shape(len(means_dn), start, length) * means_dn).mean())
 
 
 def _without_defects(means_dn: np.ndarray) -> np.ndarray:
