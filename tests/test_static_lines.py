@@ -58,6 +58,32 @@ def test_columns_are_measured_beside_a_drift(curve, pattern_e):
     assert found.conclusion.light == Light.GREEN and not told(found.doubts, "curve")
 
 
+def coloured(exponent: float, seed: int) -> np.ndarray:
+    """A series over the columns of variance 1 and power k^-exponent."""
+    n = SHAPE[1]
+    power = np.append(0.0, np.arange(1, n // 2 + 1.0) ** -exponent)
+    turns = np.random.default_rng(seed).standard_normal((2, len(power)))
+    series = np.fft.irfft((turns[0] + 1j * turns[1]) * np.sqrt(power), n)
+    return series / series.std()
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
+def test_columns_that_resemble_their_neighbours_have_a_spectrum(exponent):
+    """In bias frames of six sensors, but for those whose slow series looks like a drift."""
+    sizes, exponents = [], []
+    for seed in range(6):
+        noise = np.random.default_rng(seed).standard_normal((8, *SHAPE))
+        frames = 200 + 2 * noise + 0.75 * coloured(exponent, 100 + seed)
+        found = hsnoise.fit(np.rint(frames).astype(np.uint16), exposure_s=[0.0])
+        if "black_shading" not in found.added:
+            pattern = found.params["column_fixed_pattern"]
+            sizes.append(float(pattern.sigma))
+            exponents.append(float(pattern.exponent))
+    assert len(sizes) >= 3
+    np.testing.assert_allclose(sizes, 0.75, rtol=0.1)
+    assert abs(np.mean(exponents) - exponent) < 0.3
+
+
 @pytest.mark.parametrize("curve", ["none", pytest.param("drift", marks=pytest.mark.slow)])
 def test_stuck_pixels_are_no_pattern_and_hide_no_drift(curve):
     counts = darks(curve, 0.0)

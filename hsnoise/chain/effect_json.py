@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -63,8 +64,22 @@ def effect_from_json(
         value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")
-        values[field] = [value[channel] for channel in channels] if spec.per_channel else value
+        values[field] = _of_channels(value, channels, f"{name}.{field}") if spec.per_channel else value
+    _check_settings(item["settings"], classes[name])
     return classes[name](**values, **_measured(item, classes[name], arrays or {}), **item["settings"])
+
+
+def _of_channels(value: Any, channels: tuple[str, ...], name: str) -> list[Any]:
+    if not isinstance(value, Mapping) or set(value) != set(channels):
+        got = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
+        raise ValueError(f"{name}: expected a value for each of {', '.join(channels)} (cfa), got {got:.60}.")
+    return [value[channel] for channel in channels]
+
+
+def _check_settings(given: Mapping[str, Any], cls: type[AbstractEffect]) -> None:
+    known = {f.name for f in dataclasses.fields(cls)} - set(cls.specs()) - set(cls.array_specs())
+    if not set(given) <= known:
+        raise ValueError(f"{cls.name}: expected settings among {sorted(known)}, got {sorted(given)}.")
 
 
 def _measured(item: Mapping, cls: type[AbstractEffect], arrays: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:

@@ -175,6 +175,7 @@ def _compare(args: argparse.Namespace) -> None:
         last = [
             f"What is missing: hsnoise diagnose {capture} --model {shlex.quote(args.model)}",
             f"To add it: hsnoise improve {capture} --model {shlex.quote(args.model)}",
+            f"If the model is not of these frames, its numbers may be wrong: hsnoise fit {capture}",
         ]
     off = None if found.fits else model
     _show(args, found, page_of_comparison(found), "comparison.png", stack, off=off, fit=model, last=last)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 
+from hsnoise._core.coloured import coloured_normal, fading_power
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
@@ -14,7 +14,10 @@ from hsnoise.effects._parameters import param
 
 
 class ColumnFixedPattern(AbstractEffect):
-    """Offset of each column, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
+    """Offset of each column, e-, the same in all frames and exposures of a sensor.
+
+    One normal series runs over the columns, white or, where neighbours resemble each other, with power k^-exponent (k
+    cycles over the frame; the DC term fades out toward exponent 1).
 
     Each column has its own amplifier and converter, whose offset stays.
 
@@ -31,17 +34,21 @@ class ColumnFixedPattern(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over columns")
+    exponent: Scalar = param(
+        "1", default=0.0, held=True, doc="power falls as frequency over columns to minus this; searches hold it"
+    )
     after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         _, _, columns = signal.shape
-        pattern = jax.random.normal(capture.fixed_key(self.name), (1, 1, columns), signal.dtype)
+        power = fading_power(columns, self.exponent)
+        pattern = coloured_normal(capture.fixed_key(self.name), (1, columns, 1), power, signal.dtype).reshape(1, 1, -1)
         return signal + capture.offset(self.sigma * pattern, self.after_gain)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:
         # A fifth of the read noise, as of fixed rows: averaging frames brings it out.
-        return lambda size, rng: cls(0.2 * size * facts.read_noise_e, either_side(rng))
+        return lambda size, rng: cls(0.2 * size * facts.read_noise_e, after_gain=either_side(rng))
 
     def components(self, capture: Capture) -> dict[str, float]:
         return {"column": capture.offset_variance(self.sigma**2, self.after_gain)}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 
+from hsnoise._core.coloured import coloured_normal, fading_power
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
@@ -14,7 +14,10 @@ from hsnoise.effects._parameters import param
 
 
 class RowFixedPattern(AbstractEffect):
-    """Offset of each row, Normal(0, sigma^2) in e-, the same in all frames and exposures of a sensor.
+    """Offset of each row, e-, the same in all frames and exposures of a sensor.
+
+    One normal series runs over the rows, white or, where neighbours resemble each other, with power k^-exponent (k
+    cycles over the frame; the DC term fades out toward exponent 1).
 
     Each row has its own select and reset lines.
 
@@ -31,17 +34,21 @@ class RowFixedPattern(AbstractEffect):
     stage: ClassVar[Stage] = Stage.READ
     measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation over rows")
+    exponent: Scalar = param(
+        "1", default=0.0, held=True, doc="power falls as frequency over rows to minus this; searches hold it"
+    )
     after_gain: bool = eqx.field(static=True, default=False)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         _, rows, _ = signal.shape
-        pattern = jax.random.normal(capture.fixed_key(self.name), (1, rows, 1), signal.dtype)
+        power = fading_power(rows, self.exponent)
+        pattern = coloured_normal(capture.fixed_key(self.name), (1, rows, 1), power, signal.dtype)
         return signal + capture.offset(self.sigma * pattern, self.after_gain)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:
         # A fifth of the read noise: it stays in all frames, so less of it shows than of row noise.
-        return lambda size, rng: cls(0.2 * size * facts.read_noise_e, either_side(rng))
+        return lambda size, rng: cls(0.2 * size * facts.read_noise_e, after_gain=either_side(rng))
 
     def components(self, capture: Capture) -> dict[str, float]:
         return {"row": capture.offset_variance(self.sigma**2, self.after_gain)}

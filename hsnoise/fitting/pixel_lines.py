@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.coloured import EXPONENTS, exponent_of, fading_power
+from hsnoise.fitting.pixel_rows import LEAST_ERROR, widened
 from hsnoise.statistics.pixels.shading import FAR, Shading
 from hsnoise.statistics.pixels.survey import Plane
 
@@ -23,6 +25,8 @@ class Lines(NamedTuple):
         next_dn2: half the mean square by which a line differs from the next, the same noise taken off: all of the
             variance if each line has a level of its own, little of it if they follow a curve.
         follow: whether they follow a curve beyond chance.
+        exponent: of the spectrum over the lines, by how neighbours resemble each other; 0 and an infinite error if they
+            do not, or more than any exponent makes them.
         far, farthest_dn: how many lie far off, and by how much at most, DN.
     """
 
@@ -30,12 +34,16 @@ class Lines(NamedTuple):
     error_dn2: float
     next_dn2: float
     follow: bool
+    exponent: tuple[float, float]
     far: int
     farthest_dn: float
 
 
-def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading], frames: int) -> Lines:
-    """The static lines of an axis ("row" or "column") in the planes of one channel, means over so many frames."""
+def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading], frames: int, step: int) -> Lines:
+    """The static lines of an axis ("row" or "column") in the planes of one channel, means over so many frames.
+
+    step: lines of the sensor from one of a plane to the next.
+    """
     rest = [_rest(getattr(plane, f"{axis}_mean_dn"), shading.get(axis)) for plane in planes]
     near = [_near(of) for of in rest]
     noise = float(np.mean([_noise_dn2(plane, axis, frames) for plane in planes]))
@@ -46,9 +54,19 @@ def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading],
     error, of_beside = variance * np.sqrt(2 / lines), beside * np.sqrt(2 / (EFFICIENCY * lines))
     shared = variance - beside
     follow = shared > max(ALIKE * (variance - noise), BEYOND_CHANCE * float(np.hypot(error, of_beside)))
+    sigma, exponent = float(np.hypot(error, of_beside)), (0.0, np.inf)
+    if shared > BEYOND_CHANCE * sigma and variance > noise:
+        exponent = _exponent(shared / (variance - noise), sigma / (variance - noise), step * len(rest[0]), step)
+        error *= widened(np.array(fading_power(step * len(rest[0]), np.float32(exponent[0])), float))
     far = [np.abs(of[~there]) for of, there in zip(rest, near, strict=True)]
     farthest = max((float(of.max()) for of in far if len(of)), default=0.0)
-    return Lines(variance - noise, float(error), beside - noise, bool(follow), sum(map(len, far)), farthest)
+    return Lines(variance - noise, float(error), beside - noise, bool(follow), exponent, sum(map(len, far)), farthest)
+
+
+def _exponent(correlation: float, error: float, lines: int, step: int) -> tuple[float, float]:
+    """By the correlation of lines `step` apart, its error."""
+    low, middle, high = (exponent_of(correlation + way * error, lines, step) for way in (-1, 0, 1))
+    return middle, np.inf if middle in EXPONENTS else max((high - low) / 2, LEAST_ERROR)
 
 
 def _near(rest_dn: np.ndarray) -> np.ndarray:

@@ -80,7 +80,8 @@ def _rank(one: Shading, by_size: bool) -> float:
 def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str, Lines]:
     """Static rows and columns of a channel at the shortest dark exposure, by axis; empty without one."""
     planes = shortest_of(found, c)
-    return {axis: lines_of(planes, axis, shading, found.shortest.n_frames) for axis in AXES} if planes else {}
+    step = 1 if found.cfa == "mono" else 2
+    return {axis: lines_of(planes, axis, shading, found.shortest.n_frames, step) for axis in AXES} if planes else {}
 
 
 def patterns_of(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import gamma, poisson
 
 from hsnoise.likelihood.flat_gain import FlatGain
-from hsnoise.statistics.pixels.register import FEWEST_FRAMES, LEAST_ELECTRONS, register_of_exposures
+from hsnoise.statistics.pixels.register import FEWEST_FRAMES, LEAST_ELECTRONS, Register, register_of_exposures
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 MULTIPLIED = 1.0  # excess noise factor less 1 of a register of large gain
@@ -17,6 +17,7 @@ LESS = 3.0  # standard errors by which flats must show less
 WELL_KNOWN = 0.1  # error of the excess
 CHANCE, HIGH = 1e-3, 4.0  # of a pixel to have so many electrons, and multiplied so far; deviations of its read noise
 FEWEST_HOT = 5
+STEADY, STEADY_SIGMAS = 0.1, 5.0  # share, and standard errors, by which read noise may differ between exposures
 SPREAD_THERE = 5.0  # standard errors
 
 Number = tuple[float, float]
@@ -55,12 +56,23 @@ class Multiplied:
 
 def has_register(found: Survey) -> bool:
     """Whether darks show a gain register."""
-    return any(group.register is not None for group in found.darks)
+    return bool(_registers(found))
+
+
+def _registers(found: Survey) -> list[tuple[float, Register]]:
+    """Exposures that show a register, s; none if the noise beside its electrons grows with exposure, as shot noise
+    does without one: then these are hits."""
+    several = [(group.exposure_s, group.register) for group in found.darks if group.register is not None]
+    noise, error = np.array([one.read_noise_dn for _, one in several]).reshape(-1, 2).T
+    # Rates that differ from pixel to pixel leave a little of their noise beside the electrons.
+    off = noise - noise[:1]
+    is_steady = np.abs(off) < np.maximum(STEADY * noise[:1], STEADY_SIGMAS * np.hypot(error, error[:1]))
+    return several if is_steady.all() else []
 
 
 def multiplied_of(found: Survey) -> Multiplied | None:
     """The register of all darks; None without one."""
-    several = [(group.exposure_s, group.register) for group in found.darks if group.register is not None]
+    several = _registers(found)
     if not several:
         return None
     # Exposures that are too short to show any electrons have hardly any.

@@ -39,6 +39,7 @@ from hsnoise.effects import (
 from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_colours, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
+from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
@@ -180,6 +181,10 @@ def _population(
         found["row_noise"]["sigma"] = sigma, error * max(c.row_spectrum.widened for c in pixel.channels)
         if all(value != 0 for value, _ in exponents):
             found["row_noise"]["exponent"] = of_colours(exponents)
+    for axis in AXES:
+        of_lines = [c.lines[axis].exponent for c in pixel.channels if axis in c.lines]
+        if PATTERNS[axis] in found and all(value != 0 for value, _ in of_lines):
+            found[PATTERNS[axis]]["exponent"] = of_colours(of_lines)
     offset = of_colours([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
     if offset[0] > THERE * offset[1]:
         found["dark_signal_nonuniformity"] = {"sigma": offset}

@@ -66,7 +66,7 @@ def row_spectrum(
         banks = _banks(of, np.hypot(errors, of * alone.standard_error_dn2 / alone.variance_dn2), rows)
     exponent = _exponent(near, alone, rows, step)
     power = fading_power(rows, np.float32(exponent[0])) if banks is None else _power_of(banks, rows)
-    return RowSpectrum(exponent, banks, _widened(np.array(power, float)))
+    return RowSpectrum(exponent, banks, widened(np.array(power, float)))
 
 
 def _exponent(near: Component, alone: Component, rows: int, step: int) -> Number:
@@ -84,7 +84,7 @@ def _power_of(banks: tuple[Number, Number], rows: int) -> np.ndarray:
     return np.array(power_of_banks(rows, np.float32(exponent), shared), float)
 
 
-def _widened(power: np.ndarray) -> float:
+def widened(power: np.ndarray) -> float:
     """Root of the sum of squared correlations at all lags (Bartlett's formula for a variance)."""
     power[0] = 0.0  # the mean of the rows is the frame's
     return float(np.sqrt(np.mean(power**2)) / np.mean(power))
@@ -98,7 +98,7 @@ def _banks(correlations: np.ndarray, errors: np.ndarray, rows: int) -> tuple[Num
 
     found = numbers(correlations)
     at = (float(found[0]), 0.0), (float(np.clip(found[1], 0, 1)), 0.0)
-    wide = errors * _widened(_power_of(at, rows))
+    wide = errors * widened(_power_of(at, rows))
     # Whole errors, up and down: at a bound of the exponent, derivatives of one side are zero.
     steps = np.stack([wide, -wide])[..., None] * np.eye(2)
     apart = np.abs([[numbers(correlations + step) - found for step in of] for of in steps]).max(0)

@@ -14,7 +14,7 @@ NOTABLE = 0.01  # of the temporal variance of pixels: less changes no frame visi
 
 
 def curves(result: FitResult) -> Iterator[str]:
-    """Fixed patterns of lines that resemble their neighbours, which their effect draws one by one."""
+    """Fixed patterns of lines that follow a curve, where their effect draws a random one."""
     for axis in AXES:
         name, found = PATTERNS[axis], _lines(result, axis)
         notable = [one.follow and one.variance_dn2 > NOTABLE * temporal_dn2 for one, temporal_dn2 in found]
@@ -24,7 +24,7 @@ def curves(result: FitResult) -> Iterator[str]:
         beside = max(float(np.mean([one.next_dn2 for one, _ in found])), 0.0) ** 0.5
         yield (
             f"The fixed levels of {axis}s differ by {whole:.2g} DN, but those of neighbours only by {beside:.2g} DN:"
-            f" they follow a curve of another shape than black_shading. {name} draws each {axis} by itself."
+            f" they follow a curve of another shape than black_shading. {name} draws other curves, as smooth."
         )
 
 

@@ -63,7 +63,7 @@ def read_capture(
             levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
             about_levels += about
             files = {one.path for one in read}
-            with _naming(root if len(files) > 1 else files.pop()):
+            with _naming(root if len(files) > 1 else files.pop(), found.told):
                 stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
             stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
@@ -72,14 +72,14 @@ def read_capture(
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Errors about frames as a whole name the file, or the folder of several, unless they do."""
+def _naming(path: Path, left_out: list[str]) -> Iterator[None]:
+    """Errors about frames as a whole name the file, or the folder of several, and say what was left out of it."""
     try:
         yield
     except (TypeError, ValueError) as error:
         if str(path) in str(error):
             raise
-        raise type(error)(f"{path}: {error}") from error
+        raise type(error)(f"{path}: {error}" + "".join(f" ({one})" for one in left_out)) from error
 
 
 def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
