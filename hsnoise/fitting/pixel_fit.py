@@ -134,10 +134,12 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     """Pixel transfer, flats and population of all channels, and the joint estimate."""
     taps = taps_of(found)
     found = found if taps is None else levelled(found, taps)
-    channels = [_channel(found, c, name) for c, name in enumerate(found.channels)]
     flats = None if summary.flats is None else flat_gain(summary.flats)
-    if flats is not None and np.isfinite(flats.gain).all():
-        channels = [_with_flats(one, summary.flats, flats, c) for c, one in enumerate(channels)]
+    told = flats if flats is not None and np.isfinite(flats.gain).all() else None
+    register = multiplied_of(found, told)
+    channels = [_channel(found, c, name, register) for c, name in enumerate(found.channels)]
+    if told is not None:
+        channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
     estimate, covariance = joint_estimate(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
@@ -147,22 +149,13 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    return PixelFit(
-        tuple(channels),
-        flats,
-        ringing,
-        found.row_groups,
-        taps,
-        found.code_step,
-        estimate,
-        covariance,
-        bool(known.all()),
-    )
+    shared = ringing, found.row_groups, taps, found.code_step
+    return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 
-def _channel(found: Survey, c: int, name: str) -> Channel:
+def _channel(found: Survey, c: int, name: str, register: Multiplied | None) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
-    narrow, register = _narrow(found, c), multiplied_of(found)
+    narrow = _narrow(found, c)
     is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
     jumps, jumping = jumps_of(found, c) if is_plain else (None, None)
     tail = tail_of(found, c) if is_plain and jumps is None else None

@@ -9,11 +9,13 @@ import numpy as np
 from scipy.stats import gamma, poisson
 
 from hsnoise.likelihood.flat_gain import FlatGain
-from hsnoise.statistics.pixels.register import FEWEST_FRAMES, LEAST_ELECTRONS, Register, register_of_exposures
+from hsnoise.statistics.pixels.register import LEFT_OUT, Register, common_of, rate_and_clocks
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 MULTIPLIED = 1.0  # excess noise factor less 1 of a register of large gain
-LESS = 3.0  # standard errors by which flats must show less
+LESS = 3.0  # standard errors by which flats must show less, or clocks some electrons
+SYSTEMATIC = 0.03  # of the excess: neither a register nor flats follow their laws to less
+APART = 0.2  # of the growth of the level that electrons of the register may leave unexplained
 WELL_KNOWN = 0.1  # error of the excess
 CHANCE, HIGH = 1e-3, 4.0  # of a pixel to have so many electrons, and multiplied so far; deviations of its read noise
 FEWEST_HOT = 5
@@ -41,8 +43,9 @@ class Multiplied:
         gain: DN for each electron that enters; read_dn2: variance without electrons, rounding included, DN^2.
         growth: DN/s, and clocks: electrons whatever the exposure.
         black_dn: level without electrons.
-        excess: excess noise factor less 1; its error is infinite if that of a large gain is taken.
         pixels: how the pixels' dark currents differ.
+        confirmed: whether flats, or levels that grow by a step for each electron, say that it is one.
+        excess: excess noise factor less 1; its error is infinite if that of a large gain is taken.
     """
 
     gain: Number
@@ -51,6 +54,7 @@ class Multiplied:
     clocks: Number
     black_dn: Number
     pixels: Pixels
+    confirmed: bool
     excess: Number = (MULTIPLIED, np.inf)
 
 
@@ -70,27 +74,73 @@ def _registers(found: Survey) -> list[tuple[float, Register]]:
     return several if is_steady.all() else []
 
 
-def multiplied_of(found: Survey) -> Multiplied | None:
-    """The register of all darks; None without one."""
+def multiplied_of(found: Survey, flats: FlatGain | None = None) -> Multiplied | None:
+    """The register of all darks; None without one, and where flats or the growth of the level contradict it."""
     several = _registers(found)
     if not several:
         return None
-    # Exposures that are too short to show any electrons have hardly any.
-    without = [g.exposure_s for g in found.darks if g.register is None and g.n_frames >= FEWEST_FRAMES]
-    step, noise, rate, clocks = register_of_exposures(several, [(t, (0.0, LEAST_ELECTRONS)) for t in without])
+    step, noise = common_of([one for _, one in several])
+    entered, fits, grows = _electrons(found, step)
+    of_flats = None if flats is None else _excess_of(step, flats)
+    # Between none and that of a large multiplication, and what the two errors allow.
+    agree = of_flats is not None and -LESS * of_flats[1] < of_flats[0] < MULTIPLIED + LESS * of_flats[1]
+    if not fits or (of_flats is not None and not agree):
+        return None
+    rate, clocks = rate_and_clocks(entered)
+    if found.has_exposures and of_flats is None and not clocks[0] > LESS * clocks[1]:
+        return None  # hits come with exposure alone, a register's electrons with its clocks, too
     shortest = found.shortest
-    entered = clocks[0] + rate[0] * shortest.exposure_s
+    in_darks = clocks[0] + rate[0] * shortest.exposure_s
     level = float(np.mean([p.row_mean_dn.mean() for p in shortest.of(0)]))
-    off = np.hypot(step[0] * np.hypot(clocks[1], rate[1] * shortest.exposure_s if rate[0] else 0.0), entered * step[1])
-    lines_dn2 = _of_lines(shortest)
+    off = np.hypot(step[0] * np.hypot(clocks[1], rate[1] * shortest.exposure_s if rate[0] else 0.0), in_darks * step[1])
     return Multiplied(
         gain=step,
-        read_dn2=(max(noise[0] ** 2 - lines_dn2, 0.0), 2 * noise[0] * noise[1]),
+        read_dn2=(max(noise[0] ** 2 - _of_lines(shortest), 0.0), 2 * noise[0] * noise[1]),
         growth=(step[0] * rate[0], step[0] * rate[1]),
         clocks=clocks,
-        black_dn=(level - step[0] * entered, float(np.hypot(shortest.level_error_dn(0), off))),
+        black_dn=(level - step[0] * in_darks, float(np.hypot(shortest.level_error_dn(0), off))),
         pixels=_pixels(found, step[0], noise[0], clocks[0], rate[0]),
+        confirmed=agree or grows,
     )
+
+
+def _electrons(found: Survey, step: Number) -> tuple[list[tuple[float, Number]], bool, bool]:
+    """Electrons of each exposure, s, by its register or else by how its level differs from one that shows a register.
+
+    And whether levels contradict that each electron adds a step, and whether they show it.
+    """
+    shown = [group for group in found.repeated_darks if group.register is not None]
+    first, out, fits, grows = shown[0], [], True, False
+    of_first, level = first.register.with_step(step), _level_of_cool(found, first)
+    for group in found.repeated_darks:
+        rise = _level_of_cool(found, group) - level
+        error = float(np.hypot(group.level_error_dn(0), first.level_error_dn(0)))
+        if group.register is None:
+            by_level = of_first[0] + rise / step[0], float(np.hypot(of_first[1], error / step[0]))
+            out.append((group.exposure_s, by_level))
+            continue
+        own = group.register.with_step(step)
+        more = own[0] - of_first[0]
+        error = float(np.hypot(error, np.hypot(more * step[1], step[0] * np.hypot(own[1], of_first[1]))))
+        fits &= bool(abs(rise - step[0] * more) < max(STEADY_SIGMAS * error, APART * abs(rise)))
+        grows |= bool(rise > STEADY_SIGMAS * error)
+        out.append((group.exposure_s, own))
+    return out, fits, grows
+
+
+def _level_of_cool(found: Survey, group: Group) -> float:
+    """Mean level of the pixels that are not among the hottest, DN: other frames say which, so that no chance does."""
+    hottest = max(found.repeated_darks, key=lambda one: one.exposure_s).pixels(0, "level_dn")
+    cool = hottest <= np.quantile(hottest, 1 - LEFT_OUT, axis=1, keepdims=True)
+    levels = group.pixels(0, "level_dn").astype(np.float64)
+    return float(np.mean([levels[1 - half][cool[half]].mean() for half in (0, 1)]))
+
+
+def _excess_of(step: Number, flats: FlatGain) -> Number:
+    """Excess noise factor less 1: flats have the step times the factor as their variance over signal."""
+    ratio = float(flats.gain[0] / step[0])
+    error = ratio * float(np.hypot(flats.standard_error[0] / flats.gain[0], step[1] / step[0]))
+    return ratio - 1, error + SYSTEMATIC
 
 
 def _pixels(found: Survey, step: float, noise: float, clocks: float, rate: float) -> Pixels:
@@ -107,9 +157,10 @@ def _pixels(found: Survey, step: float, noise: float, clocks: float, rate: float
         level = off.mean(0)
         is_hot = level > limit
     hot, extra = (0.0, np.inf), (0.0, np.inf)
-    if is_hot.sum() > FEWEST_HOT:
+    beyond = float((level[is_hot] - limit).mean()) if is_hot.sum() > FEWEST_HOT else 0.0
+    if beyond > limit:  # else more were below the limit than above it
         # Exponential charges exceed any limit by their mean.
-        beyond, number = float((level[is_hot] - limit).mean()), float(is_hot.sum())
+        number = float(is_hot.sum())
         share = number / level.size * np.exp(limit / beyond)
         hot = float(share), float(share * np.sqrt(1 + (limit / beyond) ** 2) / np.sqrt(number))
         extra = beyond, beyond / float(np.sqrt(number))
@@ -137,10 +188,8 @@ def _of_lines(group: Group) -> float:
 
 
 def with_flats(register: Multiplied, flats: FlatGain) -> Multiplied:
-    """The register with what flats say of it: their variance over signal is the gain times the excess noise factor."""
-    ratio = flats.gain[0] / register.gain[0]
-    error = float(ratio * np.hypot(flats.standard_error[0] / flats.gain[0], register.gain[1] / register.gain[0]))
-    excess = float(ratio - 1)
+    """The register with what flats say of it: its excess if that is small, and else a better gain."""
+    excess, error = _excess_of(register.gain, flats)
     if error < WELL_KNOWN and excess < MULTIPLIED - LESS * error:
         return replace(register, excess=(max(excess, 0.0), error))
     values = np.array([register.gain[0], flats.gain[0] / (1 + MULTIPLIED)])

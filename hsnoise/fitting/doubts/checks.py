@@ -18,6 +18,7 @@ from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._lines import curves, defects
+from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.doubts._taps import gains_differ, outputs
 from hsnoise.fitting.flat_notes import gain_notes, scattered
@@ -63,6 +64,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     grave += alone if is_extraordinary(result) else ()
     minor = (
         *alone,
+        *of_register(result),
         *_fallen_back(result),
         *_coarse_codes(result, found),
         *_signal_of_one_exposure(result, found),
@@ -282,7 +284,7 @@ def _signal_of_one_exposure(result: FitResult, found: Survey) -> Iterator[str]:
     """That the shot noise of a dark signal is in the read noise, where no other exposure tells how much."""
     if result.transfer is None or not result.has_gain or found.shortest is None or found.has_exposures:
         return
-    if found.shortest.exposure_s > LONG_S:
+    if found.shortest.exposure_s > LONG_S and "electron_multiplication" not in result.params:
         yield (
             f"All darks are of {seconds(found.shortest.exposure_s)}, and the shot noise of their dark signal is in the"
             " read noise: add bias frames, or darks of another exposure."

@@ -16,7 +16,8 @@ EVEN = 0.8  # of the pixels that would have such changes if chance spread them; 
 DOWNWARD = 0.1  # of the far changes: telegraph noise jumps both ways
 LEFT_OUT = 0.01  # of the pixels: those that may be hot
 LEAST_ELECTRONS, LEAST_STEP = 5e-4, 2.5  # a pixel and frame; multiplied electron over read noise
-MOST_OFF = 0.2  # of the far changes that the exponential leaves unexplained
+FEWEST_FAR, BY_CHANCE = 100, 1.63  # far changes; distance of their law from the true one by chance, in 1 of 100
+MOST_OFF = 0.03  # of that distance, beyond chance
 LEAST_KNOWN = 0.25  # relative error of the step
 CODES_A_DEVIATION = 4  # of the histogram
 FEWEST_IN_BIN = 20.0
@@ -69,16 +70,16 @@ def register_of(counts: np.ndarray) -> Register | None:
     return _fitted(np.abs(np.concatenate([one.ravel() for one in cool])), sigma / np.sqrt(2))
 
 
-def register_of_exposures(
-    several: list[tuple[float, Register]], others: list[tuple[float, Number]]
-) -> tuple[Number, Number, Number, Number]:
-    """Step and read noise, DN, electrons a second, and whatever the exposure, of registers of several exposures, s.
+def common_of(several: list[Register]) -> tuple[Number, Number]:
+    """Step and read noise of registers of several exposures, DN."""
+    return _mean([one.step_dn for one in several]), _mean([one.read_noise_dn for one in several])
 
-    others: exposures that show none, with their electrons. Electrons of one exposure are those of clocks: nothing tells
-    when they came.
+
+def rate_and_clocks(entered: list[tuple[float, Number]]) -> tuple[Number, Number]:
+    """Electrons a second, and whatever the exposure, from those of each exposure, s.
+
+    Electrons of one exposure are those of clocks: nothing tells when they came.
     """
-    step, noise = (_mean([getattr(one, name) for _, one in several]) for name in ("step_dn", "read_noise_dn"))
-    entered = [(t, one.with_step(step)) for t, one in several] + others
     t = np.array([exposure_s for exposure_s, _ in entered])
     value, error = np.array([electrons for _, electrons in entered]).T
     columns = [np.ones_like(t), *([t] if np.ptp(t) > 0 else [])]
@@ -86,7 +87,7 @@ def register_of_exposures(
     solved, _ = nnls(design, value / error)
     errors = np.sqrt(np.diagonal(np.linalg.inv(design.T @ design)))
     clocks, *rate = ((float(v), float(e)) for v, e in zip(solved, errors, strict=True))
-    return step, noise, rate[0] if rate else (0.0, np.inf), clocks
+    return rate[0] if rate else (0.0, np.inf), clocks
 
 
 def _mean(pairs: list[Number]) -> Number:
@@ -171,9 +172,16 @@ def _fitted(sizes: np.ndarray, sigma: float) -> Register | None:
     chi2 = float((off[told] ** 2 / expected[told]).sum()) / max(int(told.sum()) - 3, 1)
     errors = np.sqrt(np.diagonal(covariance) * max(chi2, 1.0))
     step_dn, noise_dn, electrons = ((float(v), float(v * e)) for v, e in zip(np.exp(best.x), errors, strict=True))
-    by_chance = np.sqrt(2 / np.pi * expected)
-    left = float((np.abs(off) - by_chance)[far & told].sum() / max(expected[far & told].sum(), 1e-9))
-    is_one = left < MOST_OFF and electrons[0] > LEAST_ELECTRONS and step_dn[0] > LEAST_STEP * noise_dn[0]
+    # Largest distance between the distributions of the far changes, as Kolmogorov and Smirnov have it.
+    number = float(found[far].sum())
+    laws = [np.cumsum(of[far]) / max(float(of[far].sum()), 1e-9) for of in (found, expected)]
+    left = float(np.abs(laws[0] - laws[1]).max()) - BY_CHANCE / np.sqrt(max(number, 1.0))
+    is_one = (
+        left < MOST_OFF
+        and number > FEWEST_FAR
+        and electrons[0] > LEAST_ELECTRONS
+        and step_dn[0] > LEAST_STEP * noise_dn[0]
+    )
     together = float(covariance[0, 2] / covariance[0, 0])
     return Register(step_dn, noise_dn, electrons, together) if is_one and errors[0] < LEAST_KNOWN else None
 
