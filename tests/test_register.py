@@ -89,6 +89,57 @@ def test_a_fit_of_darks_tells_all_that_electrons_tell():
     assert fit.params["electron_multiplication"].excess == 1.0
 
 
+def ordinary(hit, exposures, lights=(), gain=0.7, read_e=5.0, rate=0.001, seed=1, level=300):
+    """A camera without a register, in which `hit(rng, exposure_s)` adds electrons to a frame; its stack."""
+    rng = np.random.default_rng(seed)
+    offset = level + rng.normal(0, 3, SHAPE)
+    dark = rate * rng.lognormal(0, 0.3, SHAPE)
+
+    def frames(exposure_s, n, light_e=0.0):
+        electrons = rng.poisson(dark * exposure_s + light_e, (n, *SHAPE)) + rng.normal(0, read_e, (n, *SHAPE))
+        struck = [hit(rng, exposure_s) for _ in range(n)]
+        return np.clip(np.round(offset + gain * (electrons + struck)), 0, 65535).astype(np.uint16)
+
+    counts = [frames(t, 16) for t in exposures] + [frames(0.01, 4, light) for light in lights]
+    kinds = ["dark"] * len(exposures) + ["flat"] * len(lights)
+    return hsnoise.FrameStack(counts, [*exposures, *[0.01] * len(lights)], kind=kinds)
+
+
+def rays(rng, exposure_s):
+    return (rng.random(SHAPE) < 3e-3 * exposure_s / 3600) * rng.exponential(400, SHAPE)
+
+
+def glitches(rng, exposure_s):
+    return (rng.random(SHAPE) < 5e-3) * rng.exponential(60, SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("hit", "exposures", "lights"),
+    [(rays, (0.0, 3600.0), ()), (glitches, (0.01,), (1e3, 5e3, 2e4)), (glitches, (0.01, 5000.0), ())],
+    ids=["rays of an hour", "glitches beside flats", "glitches beside a dark current"],
+)
+def test_hits_are_no_electrons_of_a_register(hit, exposures, lights):
+    """Though exponential and spread by chance: flats, the growth of the level, or bias frames contradict."""
+    fit = hsnoise.fit(ordinary(hit, exposures, lights))
+    assert "electron_multiplication" not in fit.params
+    gain, error, _ = fit.table["gain"]
+    assert abs(gain - 0.7) < max(4 * error, 0.1)
+
+
+def test_bright_pixels_of_one_exposure_may_be_glitches_and_the_fit_says_so():
+    fit = hsnoise.fit(ordinary(glitches, (0.01,)))
+    assert "electron_multiplication" in fit.params and fit.conclusion.light.value == "amber"
+    assert any("hits or glitches" in doubt for doubt in fit.doubts)
+
+
+def test_skewed_read_noise_is_fitted_or_refused():
+    """Its tail passes for hot pixels."""
+    rng = np.random.default_rng(1)
+    counts = np.round(300 + 2 * (rng.gamma(0.3, 6, (16, *SHAPE)) - 1.8)).astype(np.uint16)
+    fit = hsnoise.fit([counts], exposure_s=[0.0])
+    assert fit.conclusion.light.value != "green"
+
+
 def test_flats_make_the_gain_better_and_tell_a_small_multiplication():
     camera = Camera(4)
     darks, flats = [camera.frames(0.05, 16)], [camera.frames(0.05, 4, light) for light in (10.0, 40.0)]
@@ -107,6 +158,7 @@ def test_flats_make_the_gain_better_and_tell_a_small_multiplication():
     assert less.table["electron_multiplication.excess"][0] < 0.2
 
 
+@pytest.mark.slow
 def test_the_model_draws_such_frames_again():
     camera = Camera(5)
     darks = [camera.frames(0.0, 16)]

@@ -14,6 +14,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 MULTIPLIED = 1.0  # excess noise factor less 1 of a register of large gain
 LESS = 3.0  # standard errors by which flats must show less, or clocks some electrons
+LEAST_OUTPUT_E = 10.0  # read noise behind a register, where it is wanted: M is above this over that of its input
 SYSTEMATIC = 0.03  # of the excess: neither a register nor flats follow their laws to less
 APART = 0.2  # of the growth of the level that electrons of the register may leave unexplained
 WELL_KNOWN = 0.1  # error of the excess
@@ -94,7 +95,7 @@ def multiplied_of(found: Survey, flats: FlatGain | None = None) -> Multiplied | 
     level = float(np.mean([p.row_mean_dn.mean() for p in shortest.of(0)]))
     off = np.hypot(step[0] * np.hypot(clocks[1], rate[1] * shortest.exposure_s if rate[0] else 0.0), in_darks * step[1])
     return Multiplied(
-        gain=step,
+        gain=(step[0], float(np.hypot(step[1], _of_multiplication(noise[0])))),
         read_dn2=(max(noise[0] ** 2 - _of_lines(shortest), 0.0), 2 * noise[0] * noise[1]),
         growth=(step[0] * rate[0], step[0] * rate[1]),
         clocks=clocks,
@@ -197,7 +198,13 @@ def with_flats(register: Multiplied, flats: FlatGain) -> Multiplied:
     weight = errors**-2.0
     gain_dn = float(weight @ values / weight.sum())
     apart = max(abs(float(values[1] - values[0])) / float(np.hypot(*errors)), 1.0)
-    return replace(register, gain=(gain_dn, float(weight.sum() ** -0.5) * apart))
+    known = float(np.hypot(weight.sum() ** -0.5 * apart, _of_multiplication(float(np.sqrt(register.read_dn2[0])))))
+    return replace(register, gain=(gain_dn, known))
+
+
+def _of_multiplication(noise_dn: float) -> float:
+    """Error of the gain, DN/e-, by a multiplication M that is not known: single electrons scatter by 1/(2M) less."""
+    return noise_dn / (2 * LEAST_OUTPUT_E)
 
 
 def effects_of(register: Multiplied) -> dict[str, dict[str, Number]]:
