@@ -63,7 +63,9 @@ def test_other_noise_is_no_register(values):
 
 
 def test_few_frames_show_none():
-    assert register_of(Camera(1).frames(0.0, 7)) is None and register_of(Camera(1).frames(0.0, 8)) is not None
+    assert (
+        register_of(Camera(1).frames(0.0, 5)) is None and register_of(Camera(1, clocks=0.03).frames(0.0, 6)) is not None
+    )
 
 
 def test_a_fit_of_darks_tells_all_that_electrons_tell():
@@ -130,6 +132,14 @@ def test_bright_pixels_of_one_exposure_may_be_glitches_and_the_fit_says_so():
     fit = hsnoise.fit(ordinary(glitches, (0.01,)))
     assert "electron_multiplication" in fit.params and fit.conclusion.light.value == "amber"
     assert any("hits or glitches" in doubt for doubt in fit.doubts)
+
+
+def test_inspect_says_that_the_camera_may_multiply():
+    camera = Camera(6)
+    darks = [camera.frames(t, 16) for t in (0.0, 60.0)]
+    said = " ".join(hsnoise.inspect(darks, exposure_s=[0.0, 60.0]).findings)
+    assert "EMCCD" in said and "averages" not in said
+    assert "EMCCD" not in " ".join(hsnoise.inspect(ordinary(rays, (0.0, 60.0))).findings)
 
 
 def test_skewed_read_noise_is_fitted_or_refused():

@@ -58,7 +58,9 @@ def _multiplication_note(result: FitResult) -> list[str]:
     if "electron_multiplication" not in result.added:
         return []
     error = result.table["electron_multiplication.excess"][1]
-    held = "" if error > 0 else " The excess noise is that of a large multiplication; flats would measure it."
+    held = "" if error > 0 else " The excess noise is that of a large multiplication"
+    if held:
+        held += "; flats would test it." if result.summary.flats is None else ", with which the flats agree."
     return [
         "This camera multiplies its electrons (EMCCD): the gain is that of an electron which enters the register, and"
         f" read noise is in such electrons.{held}"

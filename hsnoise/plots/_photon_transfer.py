@@ -116,7 +116,8 @@ def _flats(axes: Axes, model: NoiseModel, summary: Summary) -> None:
         if len(signal):
             light_dn = np.geomspace(signal.min() / 2, signal.max() * 1.5, CURVE_POINTS)
             expected = float(model["gain"].value[c]) * light_dn * np.maximum(variance_curve(found, c, light_dn), 0)
-            axes.plot(light_dn, expected * (1 + _row_sigma(model, c) ** 2), color=COLOURS[channel], linewidth=1.6)
+            expected = expected * _excess_noise(model) * (1 + _row_sigma(model, c) ** 2)
+            axes.plot(light_dn, expected, color=COLOURS[channel], linewidth=1.6)
     axes.plot([], [], "-", color="0.3", label="fitted model, before clipping")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -128,7 +129,8 @@ def _flats(axes: Axes, model: NoiseModel, summary: Summary) -> None:
 def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     """Variance over signal of the flats and the local gain: horizontal where the response is linear."""
     axes.set_title("flat frames: gain against signal", fontsize=10)
-    axes.set_ylabel("variance over signal, gain / (DN/e$^-$)")
+    multiplied = _excess_noise(model) > 1
+    axes.set_ylabel(f"variance over signal, {'F² times the ' if multiplied else ''}gain / (DN/e$^-$)")
     found = flat_gain_of(model, summary.flats)
     for c, channel in enumerate(summary.channels):
         signal, shown = _levels(found, c)
@@ -148,6 +150,11 @@ def _gains(axes: Axes, model: NoiseModel, summary: Summary) -> None:
     plain_log(axes.xaxis)
     _gain_limits(axes, found)
     axes.legend(fontsize=9, framealpha=0.9)
+
+
+def _excess_noise(model: NoiseModel) -> float:
+    """Excess noise factor F^2 of a gain register; 1 without one."""
+    return 1 + float(model["electron_multiplication"].excess) if "electron_multiplication" in model else 1.0
 
 
 def _gain_limits(axes: Axes, found: FlatGain) -> None:

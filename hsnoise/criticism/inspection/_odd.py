@@ -23,8 +23,11 @@ DIM = 0.05  # of the brightest flat: the light of dimmer ones is not compared
 ALIKE = 0.15  # of the signal: darks whose pixels differ less are lit
 
 
-def odd_frames(facts: Facts) -> list[str]:
-    """Sentences about unreadable, identical, odd, averaged and disordered frames."""
+def odd_frames(facts: Facts, *, multiplies: bool = False) -> list[str]:
+    """Sentences about unreadable, identical, odd, averaged and disordered frames.
+
+    multiplies: whether a register may make the noise of an electron larger than in any other camera.
+    """
     darks = [group for group in facts.groups if group.kind == "dark"]
     said = [f"Not usable: {one}" for one in facts.unreadable]
     said += _identical(facts.groups)
@@ -33,7 +36,7 @@ def odd_frames(facts: Facts) -> list[str]:
     return [
         *said,
         *_order(facts.groups),
-        *_averaged(darks),
+        *([] if multiplies else _averaged(darks)),
         *_lit(darks),
         *_swapped(darks),
         *_unlit(facts.groups),

@@ -16,6 +16,7 @@ from hsnoise.criticism.budget import NoiseBudget, budget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts, facts_of
 from hsnoise.criticism.inspection._gain import about_gain, clipping, gain_of_flats
 from hsnoise.criticism.inspection._odd import odd_frames
+from hsnoise.criticism.inspection._register import about_register
 from hsnoise.criticism.inspection._verdict import about_growth, about_shared_noise, judged
 from hsnoise.frames.describing import levels_of, size_of
 from hsnoise.frames.source import as_stack
@@ -125,8 +126,10 @@ def inspect(path_or_stack: Any, *, progress=None, **keywords: Any) -> Inspection
     groups = facts.groups + (elsewhere.groups if elsewhere is not None else ())
     is_mosaic = any(group.mosaic for group in groups)
     found = judged(facts, elsewhere, main_budget, gain, is_mosaic=is_mosaic, knows_black=stack.black_level is not None)
+    of_register = about_register(facts)
     findings = [
-        *odd_frames(facts),
+        *of_register,
+        *odd_frames(facts, multiplies=bool(of_register)),
         *(odd_frames(elsewhere) if elsewhere is not None else []),
         *clipping(groups, stack.white_level is not None),
         *_coarse(groups),

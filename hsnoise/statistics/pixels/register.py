@@ -9,7 +9,7 @@ from scipy.optimize import minimize, nnls
 
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, MOST_OF_SPREAD
 
-FEWEST_FRAMES = 8
+FEWEST_FRAMES = 6  # of which a comparison holds out two of eight
 FAR = 6.0  # deviations beyond which a change is no read noise
 LEAST_FAR = 2e-4  # share of such changes from which a register is looked for
 EVEN = 0.8  # of the pixels that would have such changes if chance spread them; defects gather in few
