@@ -122,7 +122,7 @@ def _loop_arguments(commands: Any) -> None:
         "improve",
         help="fit, find what is missing, add it, until nothing is left",
         description="The whole loop: fit the frames, find the effect that the model lacks, add it and fit again, until "
-        "nothing significant is left: 5 to 20 minutes. Writes model.json, table.csv, story.txt, story.json (for "
+        "nothing significant is left: 2 to 15 minutes. Writes model.json, table.csv, story.txt, story.json (for "
         "--resume) and a figure. Exits with 1 if the model should not be used.",
     )
     for parser, name in ((compare, "compare"), (diagnose, "diagnose"), (improve, "improve")):

@@ -24,6 +24,7 @@ def about_register(facts: Facts) -> list[str]:
         return []
     return [
         "Single bright pixels of the darks look like electrons that a register multiplied (EMCCD), about"
-        f" {steps[0]:.3g} DN each: variance over signal, here and in flats, is then twice the gain, and short darks are quieter. Where"
-        " the camera has no register they are hits or glitches; hsnoise fit tells, if there are flats or long darks"
+        f" {steps[0]:.3g} DN each: variance over signal, here and in flats, is then twice the gain, and short darks are"
+        " quieter. Where the camera has no register they are hits or glitches; hsnoise fit tells, if there are flats or"
+        " long darks"
     ]
