@@ -15,7 +15,6 @@ CURVES_DN = {
     "edge": 6 * np.exp(-COLUMN / 0.012),
     "drift": 6 * np.exp(-COLUMN / 0.075),
     "line": 6 * COLUMN,
-    "step": 6 * (COLUMN > 0.5),
     "parabola": 24 * (COLUMN - 0.5) ** 2,
     "two drifts": 6 * (np.exp(-COLUMN / 0.02) + 0.5 * np.exp(-COLUMN / 0.25)),
 }
@@ -95,9 +94,7 @@ def test_stuck_pixels_are_no_pattern_and_hide_no_drift(curve):
     assert ("black_shading" in found.added) == (curve != "none")
 
 
-@pytest.mark.parametrize(
-    "curve", ["two drifts", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("step", "parabola"))]
-)
+@pytest.mark.parametrize("curve", ["two drifts", pytest.param("parabola", marks=pytest.mark.slow)])
 def test_a_curve_that_no_drift_describes_is_a_doubt(curve):
     """It is drawn as columns, because that is the nearest, and green would say that it is right."""
     found = fitted(curve, 0.2)
