@@ -242,11 +242,9 @@ def two_banks(rng):
 
 
 def emccd(rng, lights: dict[float, int] | None = None):
-    """512 stages that multiply by 300, 5 e-/DN behind them; clocks add an electron to one pixel of a hundred."""
+    """Multiplied by 300, 5 e-/DN behind the register; clocks add an electron to one pixel of a hundred."""
     shape = (200, 300)
-    sensor = Sensor(
-        rng, shape, gain=60.0, read=0.17, multiplies=True, dark=_warm(np.full(shape, 0.003), 0.003, 0.3, rng)
-    )
+    sensor = Sensor(rng, shape, gain=60.0, read=0.17, multiplies=True)
     sensor.dark = _warm(0.003 * rng.lognormal(-0.02, 0.2, shape), 0.003, 0.3, rng)
     sensor.offset_dn = 200 + 0.7 * sensor.normal() + sensor.normal(1, 300)
     sensor.exposed = lambda seconds: rng.poisson(0.01, shape)

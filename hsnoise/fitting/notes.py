@@ -57,10 +57,10 @@ def _multiplication_note(result: FitResult) -> list[str]:
     """What the numbers of a camera with a gain register refer to."""
     if "electron_multiplication" not in result.added:
         return []
-    error = result.table["electron_multiplication.excess"][1]
-    held = "" if error > 0 else " The excess noise is that of a large multiplication"
-    if held:
-        held += "; flats would test it." if result.summary.flats is None else ", with which the flats agree."
+    held = ""
+    if result.table["electron_multiplication.excess"][1] == 0:
+        flats = "; flats would test it" if result.summary.flats is None else ", with which the flats agree"
+        held = f" The excess noise is that of a large multiplication{flats}."
     return [
         "This camera multiplies its electrons (EMCCD): the gain is that of an electron which enters the register, and"
         f" read noise is in such electrons.{held}"

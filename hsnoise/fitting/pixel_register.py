@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import gamma, poisson
 
 from hsnoise.likelihood.flat_gain import FlatGain
-from hsnoise.statistics.pixels.register import LEFT_OUT, Register, common_of, rate_and_clocks
+from hsnoise.statistics.pixels.register import LEFT_OUT, Register, common_of, mean_of, rate_and_clocks
 from hsnoise.statistics.pixels.survey import Group, Survey
 
 MULTIPLIED = 1.0  # excess noise factor less 1 of a register of large gain
@@ -112,9 +112,10 @@ def _electrons(found: Survey, step: Number) -> tuple[list[tuple[float, Number]],
     """
     shown = [group for group in found.repeated_darks if group.register is not None]
     first, out, fits, grows = shown[0], [], True, False
-    of_first, level = first.register.with_step(step), _level_of_cool(found, first)
+    cool = _cool(found)
+    of_first, level = first.register.with_step(step), _level_of(first, cool)
     for group in found.repeated_darks:
-        rise = _level_of_cool(found, group) - level
+        rise = _level_of(group, cool) - level
         error = float(np.hypot(group.level_error_dn(0), first.level_error_dn(0)))
         if group.register is None:
             by_level = of_first[0] + rise / step[0], float(np.hypot(of_first[1], error / step[0]))
@@ -129,10 +130,14 @@ def _electrons(found: Survey, step: Number) -> tuple[list[tuple[float, Number]],
     return out, fits, grows
 
 
-def _level_of_cool(found: Survey, group: Group) -> float:
-    """Mean level of the pixels that are not among the hottest, DN: other frames say which, so that no chance does."""
+def _cool(found: Survey) -> np.ndarray:
+    """Pixels that are not among the hottest of the longest exposure, by each half of its frames [half, pixel]."""
     hottest = max(found.repeated_darks, key=lambda one: one.exposure_s).pixels(0, "level_dn")
-    cool = hottest <= np.quantile(hottest, 1 - LEFT_OUT, axis=1, keepdims=True)
+    return hottest <= np.quantile(hottest, 1 - LEFT_OUT, axis=1, keepdims=True)
+
+
+def _level_of(group: Group, cool: np.ndarray) -> float:
+    """Mean level of cool pixels, DN; the other half of the frames says which are, so that no chance does."""
     levels = group.pixels(0, "level_dn").astype(np.float64)
     return float(np.mean([levels[1 - half][cool[half]].mean() for half in (0, 1)]))
 
@@ -193,13 +198,9 @@ def with_flats(register: Multiplied, flats: FlatGain) -> Multiplied:
     excess, error = _excess_of(register.gain, flats)
     if error < WELL_KNOWN and excess < MULTIPLIED - LESS * error:
         return replace(register, excess=(max(excess, 0.0), error))
-    values = np.array([register.gain[0], flats.gain[0] / (1 + MULTIPLIED)])
-    errors = np.array([register.gain[1], flats.standard_error[0] / (1 + MULTIPLIED)])
-    weight = errors**-2.0
-    gain_dn = float(weight @ values / weight.sum())
-    apart = max(abs(float(values[1] - values[0])) / float(np.hypot(*errors)), 1.0)
-    known = float(np.hypot(weight.sum() ** -0.5 * apart, _of_multiplication(float(np.sqrt(register.read_dn2[0])))))
-    return replace(register, gain=(gain_dn, known))
+    halved = float(flats.gain[0] / (1 + MULTIPLIED)), float(flats.standard_error[0] / (1 + MULTIPLIED))
+    gain, known = mean_of([register.gain, halved])
+    return replace(register, gain=(gain, float(np.hypot(known, _of_multiplication(register.read_dn2[0] ** 0.5)))))
 
 
 def _of_multiplication(noise_dn: float) -> float:

@@ -72,7 +72,7 @@ def register_of(counts: np.ndarray) -> Register | None:
 
 def common_of(several: list[Register]) -> tuple[Number, Number]:
     """Step and read noise of registers of several exposures, DN."""
-    return _mean([one.step_dn for one in several]), _mean([one.read_noise_dn for one in several])
+    return mean_of([one.step_dn for one in several]), mean_of([one.read_noise_dn for one in several])
 
 
 def rate_and_clocks(entered: list[tuple[float, Number]]) -> tuple[Number, Number]:
@@ -90,7 +90,7 @@ def rate_and_clocks(entered: list[tuple[float, Number]]) -> tuple[Number, Number
     return rate[0] if rate else (0.0, np.inf), clocks
 
 
-def _mean(pairs: list[Number]) -> Number:
+def mean_of(pairs: list[Number]) -> Number:
     """Weighted mean, its error widened by the scatter."""
     values, errors = np.array(pairs, float).T
     weight = errors**-2.0
