@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 import torch
 from torch.nn import functional
@@ -27,12 +28,19 @@ def weights_of(net: STLSTM) -> Weights:
     return weights
 
 
+def device() -> torch.device:
+    """Where JAX computes, too."""
+    return torch.device("cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu")
+
+
 def training_step(net: STLSTM, noisy: np.ndarray, clean: np.ndarray, rate: float) -> Callable[[], float]:
     """A function that takes one step of Adam on frames [time, batch, row, column, channel] and returns the loss."""
-    weights = weights_of(net)
+    with device():
+        weights = weights_of(net)
+        given, wanted = (_channels_first(x) for x in (noisy, clean))
     optimiser = torch.optim.Adam(weights.values(), lr=rate)
-    given, wanted = (_channels_first(x) for x in (noisy, clean))
 
+    @device()
     def step() -> float:
         optimiser.zero_grad()
         value = _loss(_video(weights, given, net.maps, len(net.cells), net.stride), wanted)

@@ -58,7 +58,7 @@ OURS = "ST-LSTM"
 RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
 RATES = (3e-4, 1e-3, 3e-3)
 TRIAL = 1 / 6  # of the budget, for each rate
-BATCH, FRAMES, SIDE = 4, 8, 64
+FRAMES, SIDE = 8, 64
 MAPS, STRIDE = 64, 4  # of the ST-LSTM
 LEVELS, TESTED_FRAMES = 3, 10  # 10: all clips have as many, so that networks are compiled once
 SEED = 0
@@ -97,7 +97,8 @@ class Budget:
 class Setting:
     """What all trainings share.
 
-    model: the camera's, in single precision; noise: for noise maps; digest: of the camera, its light and all clips.
+    model: the camera's, in single precision; noise: for noise maps; pieces: of clips in a step; digest: of the camera,
+    its light and all clips.
     """
 
     camera: Camera
@@ -106,6 +107,7 @@ class Setting:
     train: Sequence[Clip]
     validation: Sequence[Clip]
     width: float
+    pieces: int
     out: Path
     digest: str
 
@@ -117,7 +119,7 @@ class Setting:
         return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels))
 
     def batch(self, step: int) -> Batch:
-        return crops(self.train, batch_rng(SEED, step), BATCH, FRAMES, SIDE)
+        return crops(self.train, batch_rng(SEED, step), self.pieces, FRAMES, SIDE)
 
     def start(self, name: str) -> tuple[Any, Any]:
         """The untrained network and its optimiser's state."""
@@ -160,7 +162,7 @@ def _enhanced(net, noisy: jax.Array) -> jax.Array:
 
 def named(setting: Setting, name: str, budget: Budget) -> str:
     length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
-    return f"{name}-{setting.width:g}-{length}-{setting.digest}"
+    return f"{name}-{setting.width:g}-{setting.pieces}-{length}-{setting.digest}"
 
 
 def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[Any, dict]:
@@ -253,7 +255,7 @@ def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), camera.model)
     digest = digest_of(camera.model, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
     noise = noise_map_of(camera)
-    return Setting(camera, model, noise, training, validation, options.width, options.out, digest), test
+    return Setting(camera, model, noise, training, validation, options.width, options.batch, options.out, digest), test
 
 
 def measures(
@@ -327,6 +329,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--lux", type=float, nargs=2, help="dim and bright light of the scenes (default: the paper's)")
     add("--mean-e", type=float, nargs=2, help="photoelectrons that scenes average, with a model.json instead of --lux")
     add("--width", type=float, default=0.25, help="numbers of feature maps over the published ones (default: 0.25)")
+    add("--batch", type=int, default=4, help="pieces of clips in a step of training (default: 4)")
     add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
     add("--networks", nargs="+", default=names, choices=names, help="default: all")
     add("--untrained", action="store_true", help="non-local means, total variation, and BM3D, BM4D if installed, too")
@@ -336,8 +339,11 @@ def main(argv: list[str] | None = None) -> None:
         parser.error(f"--minutes, --steps: expected more than 0, got {options.minutes}, {options.steps}")
     if min(options.rates) <= 0:
         parser.error(f"--rates: expected above 0, got {options.rates}")
-    if options.width <= 0 or options.crop < SIDE:
-        parser.error(f"--width, --crop: expected above 0 and at least {SIDE}, got {options.width:g}, {options.crop}")
+    if options.width <= 0 or options.crop < SIDE or options.batch < 1:
+        parser.error(
+            f"--width, --crop, --batch: expected above 0, at least {SIDE} and at least 1,"
+            f" got {options.width:g}, {options.crop}, {options.batch}"
+        )
     try:
         run(options)
     except ValueError as error:

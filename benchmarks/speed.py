@@ -118,12 +118,16 @@ def by_torch(mean_e) -> Callable[[], object] | None:
     except ImportError:
         return None
     shape = (FRAMES, ROWS, COLUMNS)
-    mean = torch.full(shape, mean_e) if np.isscalar(mean_e) else torch.from_numpy(mean_e)
+    where = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"  # where JAX draws, too
+    mean = (torch.full(shape, mean_e) if np.isscalar(mean_e) else torch.from_numpy(mean_e)).to(where)
 
     def run():
-        beta = torch.clamp(1 + ROW_SIGMA * torch.randn(FRAMES, ROWS, 1), min=0)
-        y = GAIN * beta * (torch.poisson(mean) + READ_E * torch.randn(shape))
-        return torch.clamp(torch.round(y), 0, WHITE).to(torch.int32)
+        beta = torch.clamp(1 + ROW_SIGMA * torch.randn(FRAMES, ROWS, 1, device=where), min=0)
+        y = GAIN * beta * (torch.poisson(mean) + READ_E * torch.randn(shape, device=where))
+        drawn = torch.clamp(torch.round(y), 0, WHITE).to(torch.int32)
+        if where == "cuda":
+            torch.cuda.synchronize()
+        return drawn
 
     return run
 

@@ -281,6 +281,16 @@ def test_same_key_same_draw(effect, single_precision):
     assert np.array_equal(first, other) == isinstance(effect, DETERMINISTIC)
 
 
+@pytest.mark.gpu
+@each_effect
+def test_an_accelerator_draws_as_the_processor(effect, single_precision):
+    here = np.asarray(sample(KEY, signal(), model_of(effect)), float)
+    with jax.default_device(jax.devices("cpu")[0]):
+        there = np.asarray(sample(KEY, signal(), model_of(effect)), float)
+    # A quantile next to a step of a Poisson number may fall on its other side.
+    assert np.mean(~np.isclose(here, there, rtol=1e-4, atol=1e-4 * np.ptp(there))) < 0.05
+
+
 @pytest.mark.slow  # operations one by one, each compiled by itself; models draw by compiled effects
 @each_effect
 def test_jit_is_eager(effect):

@@ -15,6 +15,7 @@ TRAIN = """Train the video enhancer on clean clips and the noise of a camera.
 
     hsnoise train                                        (2 minutes, on scikit-image's pictures)
     hsnoise train --preset cpu --clips FOLDER            (half an hour on 2 cores)
+    hsnoise train --preset gpu --clips FOLDER            (the same network, for longer, on a GPU)
     hsnoise train --preset paper --clips FOLDER          (a GPU)
     hsnoise train --camera hsnoise-fit/model.json --mean-e 2,10
 
