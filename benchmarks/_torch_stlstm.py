@@ -40,10 +40,10 @@ def training_step(net: STLSTM, noisy: np.ndarray, clean: np.ndarray, rate: float
         given, wanted = (_channels_first(x) for x in (noisy, clean))
     optimiser = torch.optim.Adam(weights.values(), lr=rate)
 
-    @device()
     def step() -> float:
         optimiser.zero_grad()
-        value = _loss(_video(weights, given, net.maps, len(net.cells), net.stride), wanted)
+        with device():
+            value = _loss(_video(weights, given, net.maps, len(net.cells), net.stride), wanted)
         value.backward()
         torch.nn.utils.clip_grad_norm_(weights.values(), 1.0)
         optimiser.step()

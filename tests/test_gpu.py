@@ -75,7 +75,7 @@ def device_by_device():
 
 
 def test_steps_of_training_are_those_of_the_processor():
-    camera = camera_of("canon_5d3")
+    camera = camera_of("canon_5d3", None, None)
     rng = np.random.default_rng(0)
     batch = Batch(rng.integers(0, 256, (2, 4, 32, 32, 3), np.uint8), np.full(2, 0.2, np.float32))
 
