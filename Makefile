@@ -18,13 +18,11 @@ ARGS ?=
 demo: $(VENV)/.installed
 	$(BIN)/hsnoise demo $(if $(DATA),--data "$(DATA)") $(ARGS)
 
-# Most of the time is compilation: less of it without fusion emitters, with programs compiled in one piece (there is no
-# idle core for the pieces), and if one process runs all tests of a file.
+# Most of the time is compilation: less of it with these flags, and if one process runs all tests of a file.
 # `make test-slow` compiles as users do.
-test: export XLA_FLAGS ?= --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false \
-    --xla_cpu_parallel_codegen_split_count=1
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	flags=$$($(BIN)/python tests/quick_xla.py) && XLA_FLAGS="$${XLA_FLAGS-$$flags}" \
+	    $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not gpu and not browser and not benchmark" $(ARGS)

@@ -20,13 +20,14 @@ def jit_lean(function: Callable) -> Callable:
     @cache
     def compiled():  # at the first call, not on import: asking for the options starts a backend
         jit: Any = eqx.filter_jit  # its type does not mention compiler_options
-        return jit(function, compiler_options=_lean_options())
+        return jit(function, compiler_options=lean_options())
 
     return wraps(function)(lambda *arguments: compiled()(*arguments))
 
 
 @cache
-def _lean_options() -> dict[str, bool]:
+def lean_options() -> dict[str, bool]:
+    """XLA's options for lean programs; none in versions (0.12 and later) that do not know them."""
     options = {"xla_cpu_use_fusion_emitters": False}
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import hsnoise.effects
+from hsnoise._core.compiling import lean_options
 from hsnoise.effects import (
     ADC,
     EFFECTS,
@@ -302,7 +303,7 @@ def test_jit_is_eager(effect):
 
     eager = draw(model.effects[0])
     # XLA's other emitter for CPUs, which `make test` takes, contracts products and sums: another last bit of float32.
-    jitted = jax.jit(draw, compiler_options={"xla_cpu_use_fusion_emitters": True})
+    jitted = jax.jit(draw, compiler_options=dict.fromkeys(lean_options(), True))
     np.testing.assert_allclose(jitted(model.effects[0]), eager, rtol=1e-12)
 
 
