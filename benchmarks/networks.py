@@ -341,8 +341,8 @@ def main(argv: list[str] | None = None) -> None:
         parser.error(f"--rates: expected above 0, got {options.rates}")
     if options.width <= 0 or options.crop < SIDE or options.batch < 1:
         parser.error(
-            f"--width, --crop, --batch: expected above 0, at least {SIDE} and at least 1,"
-            f" got {options.width:g}, {options.crop}, {options.batch}"
+            f"--width, --batch, --crop: expected above 0, at least 1 and at least {SIDE},"
+            f" got {options.width:g}, {options.batch}, {options.crop}"
         )
     try:
         run(options)

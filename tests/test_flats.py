@@ -9,6 +9,7 @@ import hsnoise
 from hsnoise import FrameStack
 from hsnoise._core.types import StatedGain
 from hsnoise.fitting.flat_notes import gain_notes, stated_gain_note
+from hsnoise.fitting.pixel_flats import _between
 from hsnoise.likelihood.flat_gain import flat_gain
 from hsnoise.likelihood.flats import flat_moments
 
@@ -128,6 +129,30 @@ def test_a_bent_response_leaves_gain_and_read_noise_of_the_fit_alone(rng):
         value, error, _ = fit.table[name]
         assert abs(value - truth) < 4.5 * error and error < 0.02 * truth
     assert any("The response bends" in note for note in fit.notes)
+
+
+def test_what_lies_above_full_wells_is_neither_response_nor_compared(rng):
+    """Charge that spills over evens out pixels: their response came out 6 times too small, with an error of 1 %."""
+    sensor, lights = Sensor(rng), (500.0, 1500.0, 2500.0, 3500.0)
+    sensor.response = 1 + 0.01 * rng.standard_normal(SHAPE)  # no dust, which the model does not have
+    levels = [sensor.frames(light, 4) for light in lights]
+    for light, left in ((6000.0, 0.3), (7000.0, 0.1)):
+        full = BLACK_DN + GAIN * light
+        levels.append(np.rint(full + left * (sensor.frames(light, 4) - full)).astype(np.uint16))
+    stack = FrameStack([sensor.frames(0, 8), *levels], [0.01] * 7, kind=["dark"] + ["flat"] * 6, shutter="global")
+    fit = hsnoise.fit(stack)
+    value, error, _ = fit.table["photo_response_nonuniformity.sigma"]
+    assert abs(value - 0.01) < 4 * error < 2e-3
+    assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
+    report = hsnoise.compare(fit, stack)
+    assert report.error < 4
+    assert any("2 levels of flats were not compared" in note for note in report.notes)
+
+
+def test_levels_that_disagree_show_it_in_the_error():
+    same, apart = [(0.010, 1e-4), (0.0102, 1e-4)], [(0.010, 1e-5), (0.012, 1e-5), (0.011, 1e-3)]
+    assert _between(*np.array(same).T) == 0
+    assert _between(*np.array(apart).T) == pytest.approx(0.001, rel=0.01)
 
 
 def test_a_stated_gain_that_is_wrong_is_named():

@@ -237,7 +237,7 @@ def test_width_must_be_positive():
     ("more", "words"),
     [
         (["--steps", "0"], "--minutes, --steps: expected more than 0, got 10.0, 0"),
-        (["--crop", "32"], "at least 64, got 0.25, 32"),
+        (["--crop", "32"], "at least 64, got 0.25, 4, 32"),
         (["--rates", "-1"], "--rates: expected above 0, got [-1.0]"),
         ([], "--clips: expected a folder"),
     ],

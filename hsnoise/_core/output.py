@@ -147,6 +147,7 @@ def read_image(path: str | os.PathLike) -> np.ndarray:
             raise
         raise ValueError(f"{path}: cannot be read as an image: {error or type(error).__name__}") from error
     if not isinstance(image, np.ndarray):
+        image.close()
         raise ValueError(f"{path}: expected one array, got an archive of several (.npz)")
     if image.dtype.kind not in "biuf":
         raise ValueError(f"{path}: expected an image of real numbers, got {image.dtype}")

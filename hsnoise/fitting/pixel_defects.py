@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hsnoise.fitting.pixel_fit import PixelFit, weighted_mean
+from hsnoise.fitting.pixel_fit import PixelFit
+from hsnoise.fitting.pixel_flats import weighted_mean
 from hsnoise.statistics.pixels.population import Population
 
 FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from hsnoise.fitting.pixel_classes import classes_less
+from hsnoise.fitting.pixel_flats import linear_to_dn, photo_response
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
@@ -38,9 +39,7 @@ from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.structure import (
     beside_neighbours,
-    double_differences,
     low_side_sigma,
-    of_blocks,
     plane_rows,
 )
 from hsnoise.statistics.pixels.survey import Plane, Survey
@@ -52,9 +51,6 @@ MOST_READ_NOISE_E = 300.0  # a gain that implies more comes from pedestal jumps 
 RAISED_BY = 0.1  # error of the noise of pixels that were left out for it, by the shape of its tail
 UNSEEN = 0.3  # share of the variance of unseen jumps that the gain may be off by
 UNKNOWN_SPREAD = NoiseSpread((0.0, np.inf))
-LEAST_SIGNAL_DN = 1.0  # of a flat: with less, rounding is all that differs
-LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
-MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,8 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     flats = None if summary.flats is None else flat_gain(summary.flats)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
-    channels = [_channel(found, c, name, register) for c, name in enumerate(found.channels)]
+    lit_dn = np.full(len(found.channels), np.inf) if told is None else linear_to_dn(told)
+    channels = [_channel(found, c, name, register, lit_dn[c]) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
     estimate, covariance = joint_estimate(channels)
@@ -153,7 +150,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 
-def _channel(found: Survey, c: int, name: str, register: Multiplied | None) -> Channel:
+def _channel(found: Survey, c: int, name: str, register: Multiplied | None, lit_dn: float) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
@@ -212,7 +209,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None) -> C
         shading=shading,
         row_spectrum=spectrum,
         noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if is_plain else UNKNOWN_SPREAD,
-        photo_response=_photo_response(found, c, black[0], offset[0]),
+        photo_response=photo_response(found, c, black[0], offset[0], lit_dn),
         warm=warm,
         rays=rays,
         jumps=jumps,
@@ -300,37 +297,6 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
         return 0.0, np.inf
     pattern, low_side = _pattern(found, c)
     return offset_sigma(pattern, 0.0, low_side)
-
-
-def _photo_response(found: Survey, c: int, black_dn: float, offset_dn: float) -> tuple[float, float]:
-    """Relative standard deviation of the pixels' response to light (PRNU), and its error, from 2 x 2 blocks.
-
-    From the flats that do not saturate; dust and vignetting hardly vary within a block, whose own signal counts.
-    Without any, the error is infinite.
-    """
-    several = []
-    for group in found.groups:
-        if group.kind != "flat" or group.n_frames < 2:
-            continue
-        signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
-        highest = group.pixels(c, "highest")
-        if signal < LEAST_SIGNAL_DN or (highest == highest.max()).mean() > MOST_SATURATED:
-            continue
-        rows = len(found.sampled_rows) * plane_rows(found)
-        levels = [p.halves.level_dn for p in group.of(c)]
-        blocks = np.concatenate([double_differences(of, rows) for of in levels], axis=1)
-        here = np.concatenate([of_blocks(of.mean(0), rows) for of in levels]) - black_dn
-        lit = here > LEAST_LIT * signal
-        sigma, error = offset_sigma(blocks[:, lit] / here[lit], offset_dn / signal, np.inf)
-        several.append((sigma, max(error, 1e-9)))
-    return weighted_mean(several) if several else (0.0, np.inf)
-
-
-def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values with these errors, weighted by their inverse variances, and its error."""
-    values, errors = np.array(pairs, float).T
-    weight = errors**-2
-    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:

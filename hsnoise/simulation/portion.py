@@ -17,6 +17,7 @@ MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 MOST_SATURATED = 0.2  # share of a flat's pixels
+FALLEN = 0.9  # of the largest temporal variance: less is a sensor that saturates
 BOTH = ("dark", "flat")
 
 
@@ -57,8 +58,9 @@ class Portion:
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
         bright = [i for i in range(part.n_exposures) if _is_saturated(part, i)]
-        if bright:
-            kept_exposures = [i for i in range(part.n_exposures) if i not in bright]
+        full = [i for i in _beyond_the_range(part) if i not in bright]
+        if bright or full:
+            kept_exposures = [i for i in range(part.n_exposures) if i not in (*bright, *full)]
             part, chosen = part.select(exposures=kept_exposures), [chosen[i] for i in kept_exposures]
         counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
         check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
@@ -70,6 +72,9 @@ class Portion:
             left_out.append(f"{flats} were not compared: one frame cannot separate noise from light")
         if bright:
             left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
+        if full:
+            which = f"{len(full)} levels of flats were not compared: they are brighter than the one of the largest"
+            left_out.append(f"{which} temporal variance, where a sensor saturates (EMVA 1288)")
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):
@@ -96,6 +101,26 @@ def _is_saturated(stack: FrameStack, exposure: int) -> bool:
     if stack.kind[exposure] != "flat" or stack.white_level is None:
         return False
     return float(np.mean(np.asarray(stack.counts[exposure][0]) >= stack.white_level)) > MOST_SATURATED
+
+
+def _beyond_the_range(stack: FrameStack) -> list[int]:
+    """Flats that are brighter than the one of the largest temporal variance, and whose own is clearly smaller.
+
+    That is where EMVA 1288 puts the saturation of a sensor: charge spills over, or the output bends, and no linear
+    model describes what is above. Of each level the first two frames count.
+    """
+    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
+    if not flats:
+        return []
+    pairs = [np.asarray(stack.counts[i][:2], np.float32) for i in flats]
+    mean, variance = (np.array([of(pair) for pair in pairs]) for of in (np.mean, _temporal_variance))
+    fullest = variance.argmax()
+    beyond = (mean > mean[fullest]) & (variance < FALLEN * variance[fullest])
+    return [i for i, is_beyond in zip(flats, beyond, strict=True) if is_beyond]
+
+
+def _temporal_variance(pair: np.ndarray) -> float:
+    return float(np.var(pair[1] - pair[0]) / 2)
 
 
 def middle_of(stack: FrameStack, kinds: tuple[str, ...] = BOTH) -> FrameStack:

@@ -32,6 +32,7 @@ def read(path: Path) -> list[Recording]:
         if path.suffix.lower() == ".npy":
             found = np.load(path, mmap_mode="r")
             if not isinstance(found, np.ndarray):
+                found.close()
                 raise ValueError("it is an archive of several arrays; give it the suffix .npz")
             _check_end(found.nbytes, path.stat().st_size - found.offset)
             return recordings(path, _groups(found), {})
