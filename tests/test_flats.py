@@ -146,7 +146,7 @@ def test_what_lies_above_full_wells_is_neither_response_nor_compared(rng):
     assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
     report = hsnoise.compare(fit, stack)
     assert report.error < 4
-    assert any("2 levels of flats were not compared" in note for note in report.notes)
+    assert "2 levels of flats were not compared" in " ".join(str(report).split())
 
 
 def test_levels_that_disagree_show_it_in_the_error():
