@@ -146,7 +146,23 @@ def test_what_lies_above_full_wells_is_neither_response_nor_compared(rng):
     assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
     report = hsnoise.compare(fit, stack)
     assert report.error < 4
-    assert "2 levels of flats were not compared" in " ".join(str(report).split())
+    assert "4 levels of flats were not compared: they are above 70 %" in " ".join(str(report).split())
+
+
+def test_flats_that_are_all_saturated_are_a_doubt(rng):
+    """They gave the spread of the full wells as photo response, in green, and "gain from the flats"."""
+    dark_e, wells = 20.0 * rng.lognormal(0, 0.5, SHAPE), 6000.0 * (1 + 0.03 * rng.standard_normal(SHAPE))
+
+    def taken(electrons):
+        return np.rint(BLACK_DN + GAIN * (electrons + READ_E * rng.standard_normal((8, *SHAPE)))).astype(np.uint16)
+
+    darks = [taken(rng.poisson(dark_e * t, (8, *SHAPE))) for t in (0.0, 4.0, 16.0)]
+    flats = [taken(np.minimum(rng.poisson(light, (8, *SHAPE)), wells)) for light in (8000.0, 9000.0)]
+    kind, exposure_s = ["dark"] * 3 + ["flat"] * 2, [0.0, 4.0, 16.0, 0.01, 0.01]
+    fit = hsnoise.fit(FrameStack([*darks, *flats], exposure_s, kind=kind, shutter="global"))
+    assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
+    assert "photo_response_nonuniformity.sigma" not in fit.table and "gain from the flats" not in str(fit)
+    assert any("they are saturated, or the gain is wrong" in doubt for doubt in fit.doubts)
 
 
 def test_levels_that_disagree_show_it_in_the_error():

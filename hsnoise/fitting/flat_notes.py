@@ -37,6 +37,23 @@ def scattered(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
     return [note for c, channel in enumerate(channels) for note in _scattered(found, c, _of(channel))]
 
 
+def contradicted(found: FlatGain, flats: FlatMoments, gain: np.ndarray, channels: tuple[str, ...]) -> list[str]:
+    """Sentences on flats that do not determine the gain, and vary less than this gain [channel], DN/e-, says."""
+    signal, excess = flats.mean_dn - flats.dark_dn, flats.variance_dn2 - flats.dark_variance_dn2
+    chance = gain * signal * np.sqrt(2 / flats.dof)
+    notes = []
+    for c in np.flatnonzero(~np.isfinite(found.gain)):
+        below = (gain * signal - excess > BLACK_SIGMAS * np.hypot(chance, flats.dark_error_dn2))[:, c]
+        if below.any():
+            brightest = np.nanargmax(np.where(below, signal[:, c], np.nan))
+            share = max(excess[brightest, c] / (gain[c] * signal[brightest, c]), 0.0)
+            notes.append(
+                f"The flats{_of(channels[c])} vary over time by {100 * share:.2g} % of what the darks' gain makes of"
+                f" their {signal[brightest, c]:.4g} DN of signal: they are saturated, or the gain is wrong."
+            )
+    return notes
+
+
 def _of(channel: str) -> str:
     return "" if channel == "mono" else f" of channel {channel}"
 

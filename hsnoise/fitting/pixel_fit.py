@@ -133,7 +133,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     flats = None if summary.flats is None else flat_gain(summary.flats)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
-    lit_dn = np.full(len(found.channels), np.inf) if told is None else linear_to_dn(told)
+    lit_dn = np.zeros(len(found.channels)) if told is None else linear_to_dn(told)
     channels = [_channel(found, c, name, register, lit_dn[c]) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]

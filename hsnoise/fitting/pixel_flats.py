@@ -31,7 +31,8 @@ def photo_response(
     Dust and vignetting hardly vary within a block, whose own signal counts. Without any, the error is infinite. If the
     levels disagree, it holds their scatter.
     """
-    several = []
+    several: list[tuple[float, float]] = []
+    contrasts: list[int] = []
     for group in found.groups:
         if group.kind != "flat" or group.n_frames < 2:
             continue
@@ -46,10 +47,13 @@ def photo_response(
         lit = here > LEAST_LIT * signal
         sigma, error = offset_sigma(blocks[:, lit] / here[lit], offset_dn / signal, np.inf)
         several.append((sigma, max(error, 1e-9)))
+        contrasts.append(lit.sum())
     if not several:
         return 0.0, np.inf
     apart = _between(*np.array(several).T)
-    return weighted_mean([(sigma, float(np.hypot(error, apart))) for sigma, error in several])
+    sigma, error = weighted_mean([(sigma, float(np.hypot(error, apart))) for sigma, error in several])
+    # All levels show the same pixels: more of them do not make up for how few these are.
+    return sigma, max(error, sigma / float(np.sqrt(2 * max(contrasts))))
 
 
 def _between(values: np.ndarray, errors: np.ndarray) -> float:

@@ -142,7 +142,7 @@ def _detail(pixel: PixelFit) -> str:
     if pixel.channels[0].register is not None:
         return "gain from single electrons that a register multiplied" + (" and the flats" if pixel.flats else "")
     told = [c.transfer for c in pixel.channels if c.transfer is not None]
-    if pixel.flats is not None and pixel.determined:
+    if pixel.flats is not None and np.isfinite(pixel.flats.gain).all() and pixel.determined:
         return "gain from the flats, read noise from each pixel over time"
     if not told or not pixel.determined:
         return "each pixel over time, no gain"

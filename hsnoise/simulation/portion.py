@@ -17,6 +17,7 @@ MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 MOST_SATURATED = 0.2  # share of a flat's pixels
+LINEAR = 0.7  # of saturation: the range in which EMVA 1288 takes photon transfer for a line
 FALLEN = 0.9  # of the largest temporal variance: less is a sensor that saturates
 RARE = 0.01  # share of a frame that rays may hit
 BOTH = ("dark", "flat")
@@ -74,8 +75,8 @@ class Portion:
         if bright:
             left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
         if full:
-            which = f"{len(full)} levels of flats were not compared: they are brighter than the one of the largest"
-            left_out.append(f"{which} temporal variance, where a sensor saturates (EMVA 1288)")
+            which = f"{len(full)} levels of flats were not compared: they are above {100 * LINEAR:.0f} % of saturation,"
+            left_out.append(f"{which} which is where the temporal variance is largest (EMVA 1288)")
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):
@@ -105,19 +106,22 @@ def _is_saturated(stack: FrameStack, exposure: int) -> bool:
 
 
 def _beyond_the_range(stack: FrameStack) -> list[int]:
-    """Flats that are brighter than the one of the largest temporal variance, and whose own is clearly smaller.
+    """Flats above 70 % of saturation, which is the signal of the largest temporal variance (EMVA 1288).
 
-    That is where EMVA 1288 puts the saturation of a sensor: charge spills over, or the output bends, and no linear
-    model describes what is above. Of each level the first two frames count.
+    If brighter ones show by a clearly smaller variance that it is: charge spills over there, or the output bends, and
+    no linear model describes it. Of each level the first two frames count.
     """
     flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
     if not flats:
         return []
+    darkest = min((i for i, kind in enumerate(stack.kind) if kind == "dark"), key=lambda i: stack.exposure_s[i])
     pairs = [np.asarray(stack.counts[i][:2], np.float32) for i in flats]
-    mean, variance = (np.array([of(pair) for pair in pairs]) for of in (np.mean, _temporal_variance))
+    variance = np.array([_temporal_variance(pair) for pair in pairs])
+    signal = np.array([pair.mean() for pair in pairs]) - np.mean(stack.counts[darkest][0])
     fullest = variance.argmax()
-    beyond = (mean > mean[fullest]) & (variance < FALLEN * variance[fullest])
-    return [i for i, is_beyond in zip(flats, beyond, strict=True) if is_beyond]
+    if not (variance[signal > signal[fullest]] < FALLEN * variance[fullest]).any():
+        return []
+    return [i for i, level in zip(flats, signal, strict=True) if level > LINEAR * signal[fullest]]
 
 
 def _temporal_variance(pair: np.ndarray) -> float:

@@ -21,7 +21,7 @@ from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.doubts._taps import gains_differ, outputs
-from hsnoise.fitting.flat_notes import gain_notes, scattered
+from hsnoise.fitting.flat_notes import contradicted, gain_notes, scattered
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method, Status
@@ -346,7 +346,10 @@ def _scattered_flats(result: FitResult) -> list[str]:
     if flats is None:
         return []
     found = flat_gain_of(result.params, flats) if result.transfer is None else result.transfer.flats
-    return [] if found is None else scattered(found, result.summary.channels)
+    if found is None:
+        return []
+    channels, gain = result.summary.channels, np.atleast_1d(np.asarray(result.params["gain"].value))
+    return [*scattered(found, channels), *contradicted(found, flats, np.broadcast_to(gain, len(channels)), channels)]
 
 
 def _of_neighbours(result: FitResult) -> Iterator[str]:
