@@ -146,7 +146,7 @@ def test_what_lies_above_full_wells_is_neither_response_nor_compared(rng):
     assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
     report = hsnoise.compare(fit, stack)
     assert report.error < 4
-    assert "4 levels of flats were not compared: they are above 70 %" in " ".join(str(report).split())
+    assert "4 levels of flats not compared: above 70 %" in " ".join(str(report).split())
 
 
 def test_flats_that_are_all_saturated_are_a_doubt(rng):
@@ -163,6 +163,17 @@ def test_flats_that_are_all_saturated_are_a_doubt(rng):
     assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
     assert "photo_response_nonuniformity.sigma" not in fit.table and "gain from the flats" not in str(fit)
     assert any("they are saturated, or the gain is wrong" in doubt for doubt in fit.doubts)
+
+
+@pytest.mark.parametrize("lights", [(6000.0,), (3000.0, 6000.0)], ids=len)
+def test_one_level_of_flats_beside_bias_frames_is_a_doubt(rng, lights):
+    """Near a full well its gain was 24 % too small, in green: nothing shows that the response bends there."""
+    sensor = Sensor(rng)
+    frames = [sensor.frames(0, 8), *(sensor.frames(light, 4) for light in lights)]
+    exposure_s, kind = [0.01] * len(frames), ["dark"] + ["flat"] * len(lights)
+    fit = hsnoise.fit(FrameStack(frames, exposure_s, kind=kind, shutter="global", white_level=WHITE_DN))
+    assert abs(fit.table["gain"][0] - GAIN) < 4 * fit.table["gain"][1]
+    assert any("One level of flats determines the gain" in doubt for doubt in fit.doubts) == (len(lights) == 1)
 
 
 def test_levels_that_disagree_show_it_in_the_error():

@@ -23,6 +23,23 @@ def flat_notes(result: FitResult) -> list[str]:
     return gain_notes(flat_gain_of(result.params, flats), flats, result.summary.channels)
 
 
+def flat_doubts(result: FitResult) -> list[str]:
+    """What the flats leave in doubt about the gain."""
+    flats, pixel, channels = result.summary.flats, result.transfer, result.summary.channels
+    if flats is None:
+        return []
+    found = flat_gain_of(result.params, flats) if pixel is None else pixel.flats
+    if found is None:
+        return []
+    doubts = scattered(found, channels)
+    if pixel is None or not pixel.determined or pixel.channels[0].register is not None:
+        return doubts
+    if all(one.transfer is None for one in pixel.channels):  # darks of one exposure tell no gain
+        return doubts + _lone_level(found, channels)
+    gain = np.broadcast_to(np.asarray(result.params["gain"].value), len(channels))
+    return doubts + _contradicted(found, flats, gain, channels)
+
+
 def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -> list[str]:
     """Notes on the gain from flats."""
     notes = list(flats.set_aside)
@@ -37,7 +54,19 @@ def scattered(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
     return [note for c, channel in enumerate(channels) for note in _scattered(found, c, _of(channel))]
 
 
-def contradicted(found: FlatGain, flats: FlatMoments, gain: np.ndarray, channels: tuple[str, ...]) -> list[str]:
+def _lone_level(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
+    """A sentence if one level alone determines the gain; darks that tell it would show whether it is right."""
+    lone = [c for c in range(len(channels)) if found.used[:, c].sum() == 1]
+    if not lone:
+        return []
+    of = _of(channels[lone[0]]) if len(lone) < len(channels) else ""
+    return [
+        f"One level of flats{of} determines the gain, and nothing shows whether the response bends or saturates there:"
+        " two or more levels, or dark exposures of several lengths, would."
+    ]
+
+
+def _contradicted(found: FlatGain, flats: FlatMoments, gain: np.ndarray, channels: tuple[str, ...]) -> list[str]:
     """Sentences on flats that do not determine the gain, and vary less than this gain [channel], DN/e-, says."""
     signal, excess = flats.mean_dn - flats.dark_dn, flats.variance_dn2 - flats.dark_variance_dn2
     chance = gain * signal * np.sqrt(2 / flats.dof)

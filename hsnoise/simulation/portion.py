@@ -75,8 +75,8 @@ class Portion:
         if bright:
             left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
         if full:
-            which = f"{len(full)} levels of flats were not compared: they are above {100 * LINEAR:.0f} % of saturation,"
-            left_out.append(f"{which} which is where the temporal variance is largest (EMVA 1288)")
+            which = f"{len(full)} level{'s' * (len(full) > 1)} of flats not compared: above {100 * LINEAR:.0f} % of"
+            left_out.append(f"{which} saturation, which is where the temporal variance is largest (EMVA 1288)")
         if end - first < columns:
             left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
         if frames < sum(stack.n_frames[i] for i in chosen):

@@ -21,11 +21,10 @@ from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.doubts._taps import gains_differ, outputs
-from hsnoise.fitting.flat_notes import contradicted, gain_notes, scattered
+from hsnoise.fitting.flat_notes import flat_doubts, gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method, Status
-from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
 from hsnoise.statistics.pixels.along_rows import of_the_signal
 from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
@@ -79,7 +78,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_many_hot(result),
         *curves(result),
         *gains_differ(result),
-        *_scattered_flats(result),
+        *flat_doubts(result),
     )
     doubts = tuple(dict.fromkeys([*grave, *minor]))
     notes = result.notes
@@ -339,17 +338,6 @@ def _outliers(result: FitResult) -> Iterator[str]:
 def _of_flats(result: FitResult) -> list[str]:
     flats = result.transfer.flats
     return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
-
-
-def _scattered_flats(result: FitResult) -> list[str]:
-    flats = result.summary.flats
-    if flats is None:
-        return []
-    found = flat_gain_of(result.params, flats) if result.transfer is None else result.transfer.flats
-    if found is None:
-        return []
-    channels, gain = result.summary.channels, np.atleast_1d(np.asarray(result.params["gain"].value))
-    return [*scattered(found, channels), *contradicted(found, flats, np.broadcast_to(gain, len(channels)), channels)]
 
 
 def _of_neighbours(result: FitResult) -> Iterator[str]:
