@@ -22,9 +22,7 @@ def linear_to_dn(flats: FlatGain) -> np.ndarray:
     return np.where(flats.used, flats.signal_dn, 0.0).max(0)
 
 
-def photo_response(
-    found: Survey, c: int, black_dn: float, offset_dn: float, lit_dn: float = np.inf
-) -> tuple[float, float]:
+def photo_response(found: Survey, c: int, black_dn: float, offset_dn: float, lit_dn: float) -> tuple[float, float]:
     """Relative standard deviation of the pixels' response to light (PRNU), and its error, from 2 x 2 blocks.
 
     From flats up to `lit_dn` that do not saturate: charge that spills over evens out pixels that are nearly full.

@@ -43,7 +43,7 @@ PRESETS = {
     # In so little light, details below 4 pixels are lost: coarse blocks see four times the scene in the same time.
     "smoke": Preset(200, 4, 4, 64, 100, Recipe(maps=8, stride=4, rate=5e-3)),
     "cpu": Preset(4_400, 4, 12, 64, 500, Recipe(maps=16, stride=4, rate=2e-3, warm_up=24)),
-    # The same network, and so as fast in use. A GPU takes eight times as many pieces in hardly more time.
+    # The same network, and so as fast in use, from 36 times as many pieces.
     "gpu": Preset(20_000, 32, 12, 64, 1000, Recipe(maps=16, stride=4, rate=2e-3, warm_up=24)),
     "paper": Preset(100_000, 8, 8, 64, 1000, Recipe(maps=64, decay=False)),
 }
