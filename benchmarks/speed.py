@@ -115,17 +115,18 @@ def by_jax_random(mean_e) -> Callable[[], jax.Array]:
 def by_torch(mean_e) -> Callable[[], object] | None:
     try:
         import torch
+
+        from benchmarks._torch_stlstm import device
     except ImportError:
         return None
-    shape = (FRAMES, ROWS, COLUMNS)
-    where = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"  # where JAX draws, too
+    shape, where = (FRAMES, ROWS, COLUMNS), device()
     mean = (torch.full(shape, mean_e) if np.isscalar(mean_e) else torch.from_numpy(mean_e)).to(where)
 
     def run():
         beta = torch.clamp(1 + ROW_SIGMA * torch.randn(FRAMES, ROWS, 1, device=where), min=0)
         y = GAIN * beta * (torch.poisson(mean) + READ_E * torch.randn(shape, device=where))
         drawn = torch.clamp(torch.round(y), 0, WHITE).to(torch.int32)
-        if where == "cuda":
+        if where.type == "cuda":
             torch.cuda.synchronize()
         return drawn
 

@@ -59,19 +59,11 @@ def test_fits_are_those_of_the_processor():
     camera = hsnoise.cameras.canon_5d3()
     counts = [np.asarray(hsnoise.sample_dark(i, 4, (96, 128), camera, exposure_s=t)) for i, t in enumerate(EXPOSURE_S)]
     stack = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=0, white_level=16383, cfa="RGGB", shutter="rolling")
-    here, there = (
-        {name: (row[0], row[1]) for name, row in hsnoise.fit(stack).table.items()} for _ in device_by_device()
-    )
+    here, there = on_both(lambda: {name: row[:2] for name, row in hsnoise.fit(stack).table.items()})
     assert here.keys() == there.keys()
     for name, (value, error) in here.items():
         other = there[name][0]
         assert abs(value - other) <= 1e-2 * error + 1e-9 * abs(other), name
-
-
-def device_by_device():
-    yield
-    with jax.default_device(jax.devices("cpu")[0]):
-        yield
 
 
 def test_steps_of_training_are_those_of_the_processor():
