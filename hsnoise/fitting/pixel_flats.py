@@ -6,7 +6,7 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 from hsnoise.likelihood.flat_gain import FlatGain
-from hsnoise.statistics.pixels.population import offset_sigma
+from hsnoise.statistics.pixels.population import root_of, shared_variance
 from hsnoise.statistics.pixels.structure import double_differences, of_blocks, plane_rows
 from hsnoise.statistics.pixels.survey import Survey
 
@@ -43,13 +43,14 @@ def photo_response(found: Survey, c: int, black_dn: float, offset_dn: float, lit
         blocks = np.concatenate([double_differences(of, rows) for of in levels], axis=1)
         here = np.concatenate([of_blocks(of.mean(0), rows) for of in levels]) - black_dn
         lit = here > LEAST_LIT * signal
-        sigma, error = offset_sigma(blocks[:, lit] / here[lit], offset_dn / signal, np.inf)
-        several.append((sigma, max(error, 1e-9)))
+        variance, error = shared_variance(blocks[:, lit] / here[lit])
+        several.append((variance - (offset_dn / signal) ** 2, max(error, 1e-12)))
         contrasts.append(lit.sum())
     if not several:
         return 0.0, np.inf
     apart = _between(*np.array(several).T)
-    sigma, error = weighted_mean([(sigma, float(np.hypot(error, apart))) for sigma, error in several])
+    # Variances, not their roots, are averaged: a root of what may be negative is too large on average.
+    sigma, error = root_of(*weighted_mean([(of, float(np.hypot(error, apart))) for of, error in several]))
     # All levels show the same pixels: more of them do not make up for how few these are.
     return sigma, max(error, sigma / float(np.sqrt(2 * max(contrasts))))
 

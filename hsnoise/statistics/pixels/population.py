@@ -289,13 +289,22 @@ def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) 
 
     At most that of the pixels below the median: warm pixels are not normal offsets.
     """
+    variance, error = shared_variance(pattern)
+    return root_of(min(variance, low_side_dn**2) - dark_sigma_dn**2, error)
+
+
+def shared_variance(pattern: np.ndarray) -> tuple[float, float]:
+    """Variance over pixels that two halves of the frames [half, pixel] have in common, outliers cut, and its error."""
     width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
     a, b = np.clip(pattern, -width, width).astype(np.float64)
     product = (a - a.mean()) * (b - b.mean())
-    both = min(float(product.mean()), low_side_dn**2)
-    variance, error = both - dark_sigma_dn**2, float(product.std()) / np.sqrt(len(product))
-    sigma = np.sqrt(max(variance, 0.0))
-    return float(sigma), float(min(error / max(2 * sigma, 1e-12), np.sqrt(error)))
+    return float(product.mean()), float(product.std()) / np.sqrt(len(product))
+
+
+def root_of(variance: float, error: float) -> tuple[float, float]:
+    """Standard deviation, 0 of a negative variance, and its error."""
+    sigma = float(np.sqrt(max(variance, 0.0)))
+    return sigma, float(min(error / max(2 * sigma, 1e-12), np.sqrt(error)))
 
 
 def _at_readout(pixels: Levels, halves: np.ndarray, noise: float, rate: float) -> tuple[float, float]:

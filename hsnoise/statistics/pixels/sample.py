@@ -92,10 +92,15 @@ def halves_of(counts: np.ndarray) -> Halves:
     n = len(counts)
     lowest, highest = counts.min(0).ravel(), counts.max(0).ravel()
     values = counts.astype(np.float32)
-    frame_means, added, of_lines = _take_off_common(values)
+    frame_means, share, power, of_lines = _take_off_common(values)
+    added = np.float32(share * power)
     flat = values.reshape(n, -1)
     parts = [_moments(flat[half::2], added) for half in (0, 1)]
     level, variance, peak = (np.stack(x) for x in zip(*parts, strict=True))
+    # As if a pixel's own noise were in the offsets: they cancel in differences of neighbours then, and the products of
+    # two halves, in which the same offsets have opposite signs, are not too small.
+    of_other = np.array([[len(flat[1::2])], [len(flat[::2])]], np.float32) / np.float32(n)
+    level += np.float32(share) * of_other * (level[::-1] - level)
     level = (level.reshape(2, *values.shape[1:]) - _left_in_lines(values.mean(0), of_lines)).reshape(2, -1)
     whole = flat.var(0, ddof=1) - added
     third, fourth = _higher(flat)
@@ -135,12 +140,12 @@ def _left_in_lines(mean: np.ndarray, of_lines: tuple[float, float]) -> np.ndarra
     return left
 
 
-def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[float, float]]:
+def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, float, float, tuple[float, float]]:
     """Subtract the offsets of frames, and of rows and columns in a frame, from `values` in place.
 
     A pixel's offsets come from the other pixels of its row and column, so that none of its own noise is subtracted.
-    Returns the offsets of the frames, the variance that the offsets' own noise adds to each pixel, and the variance of
-    rows and of columns in the mean over frames, DN^2.
+    Returns the offsets of the frames, DN; the share of a pixel's variance that the offsets' own noise adds to it; the
+    typical such variance, DN^2; and the variance of rows and of columns in the mean over frames, DN^2.
     """
     n, h, w = values.shape
     mean = values.mean(0)
@@ -170,7 +175,7 @@ def _take_off_common(values: np.ndarray) -> tuple[np.ndarray, np.float32, tuple[
     of_lines = tuple(
         max(of / (n - 1) - of_pixels / of_each, 0.0) / n for of, of_each in ((of_rows, w), (of_columns, h))
     )
-    return offsets - typical, np.float32(of_pixels * share), of_lines
+    return offsets - typical, share, of_pixels, of_lines
 
 
 def _middle(rest: np.ndarray) -> float:

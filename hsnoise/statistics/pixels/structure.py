@@ -82,9 +82,13 @@ def beside_neighbours(level: np.ndarray, rows: float) -> np.ndarray:
     as much, and a pattern in which neighbours resemble each other keeps its variance.
     """
     maps = level.reshape(2, int(rows), -1)
+    _, height, width = maps.shape
     maps = maps - np.median(maps, axis=1, keepdims=True)
-    around = uniform_filter1d(maps, PIECE, axis=2)
-    return (np.sqrt(np.float32(PIECE / (PIECE - 1))) * (maps - around)).reshape(2, -1)
+    piece = min(PIECE, width)
+    starts = np.clip(np.arange(width) - piece // 2, 0, width - piece)  # near the edges, the last whole piece
+    around = uniform_filter1d(maps, piece, axis=2)[..., starts + piece // 2]
+    kept = (1 - 1 / piece if piece > 1 else 1.0) * (1 - (2 - np.pi / 2) / height)  # of the variance of a white pattern
+    return (np.float32(max(kept, 0.5) ** -0.5) * (maps - around)).reshape(2, -1)
 
 
 def low_side_sigma(level: np.ndarray, rows: float, frames: int) -> float:
