@@ -300,11 +300,15 @@ def _offset(found: Survey, c: int) -> tuple[float, float]:
 
 
 def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
-    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN."""
+    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN.
+
+    Without stuck pixels.
+    """
     rows = len(found.sampled_rows) * plane_rows(found)
     halves = [plane.halves for plane in shortest_of(found, c)]
     low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
-    return np.concatenate([beside_neighbours(of.level_dn, rows) for of in halves], axis=1), low_side
+    pattern = np.concatenate([beside_neighbours(of.level_dn, rows) for of in halves], axis=1)
+    return pattern[:, ~found.stuck(c)], low_side
 
 
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy  # its parts are imported when they are used
 
 from hsnoise.likelihood.flat_gain import FlatGain
+from hsnoise.statistics.pixels.flags import is_dead
 from hsnoise.statistics.pixels.population import root_of, shared_variance
-from hsnoise.statistics.pixels.structure import double_differences, of_blocks, plane_rows
+from hsnoise.statistics.pixels.structure import plane_rows, within_blocks
 from hsnoise.statistics.pixels.survey import Survey
 
 LEAST_SIGNAL_DN = 1.0  # of a flat: with less, rounding is all that differs
 LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
 SAME_LIGHT = 1.01  # signals of one level above black levels that were reckoned apart
+SIDES = 2, 8  # pixels of a block
+AGREE_SIGMAS = 2.0  # between what small and large blocks show
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 CONTRADICTION = 1e-3  # chance of levels of light that scatter so much beyond their errors
 
@@ -23,36 +28,65 @@ def linear_to_dn(flats: FlatGain) -> np.ndarray:
 
 
 def photo_response(found: Survey, c: int, black_dn: float, offset_dn: float, lit_dn: float) -> tuple[float, float]:
-    """Relative standard deviation of the pixels' response to light (PRNU), and its error, from 2 x 2 blocks.
+    """Relative standard deviation of the pixels' response to light (PRNU), and its error, within blocks of pixels.
 
-    From flats up to `lit_dn` that do not saturate: charge that spills over evens out pixels that are nearly full.
-    Dust and vignetting hardly vary within a block, whose own signal counts. Without any, the error is infinite. If the
-    levels disagree, it holds their scatter.
+    From flats up to `lit_dn` that do not saturate: charge that spills over evens out pixels that are nearly full. Dust
+    and vignetting hardly vary within a block, whose own signal counts; if they vary within the large ones, the small
+    ones count. Dead and stuck pixels are left out. Without flats, the error is infinite. If the levels disagree, it
+    holds their scatter.
     """
-    several: list[tuple[float, float]] = []
-    contrasts: list[int] = []
-    for group in found.groups:
-        if group.kind != "flat" or group.n_frames < 2:
-            continue
-        signal = float(np.mean([p.row_mean_dn.mean() for p in group.of(c)])) - black_dn
-        highest = group.pixels(c, "highest")
-        if not LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * lit_dn or (highest == highest.max()).mean() > MOST_SATURATED:
-            continue
-        rows = len(found.sampled_rows) * plane_rows(found)
-        levels = [p.halves.level_dn for p in group.of(c)]
-        blocks = np.concatenate([double_differences(of, rows) for of in levels], axis=1)
-        here = np.concatenate([of_blocks(of.mean(0), rows) for of in levels]) - black_dn
-        lit = here > LEAST_LIT * signal
-        variance, error = shared_variance(blocks[:, lit] / here[lit])
-        several.append((variance - (offset_dn / signal) ** 2, max(error, 1e-12)))
-        contrasts.append(lit.sum())
-    if not several:
+    several = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
+    signals = [float(np.mean([p.row_mean_dn.mean() for p in g.of(c)])) - black_dn for g in several]
+    levels = [
+        Level([p.halves.level_dn for p in g.of(c)], signal, offset_dn / signal)
+        for g, signal in zip(several, signals, strict=True)
+        if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * lit_dn and not _saturates(g.pixels(c, "highest"))
+    ]
+    if not levels:
         return 0.0, np.inf
-    apart = _between(*np.array(several).T)
+    sound = np.split(~(is_dead(found, c) | found.stuck(c)), len(levels[0].planes))
+    rows = len(found.sampled_rows) * plane_rows(found)
+    small, large = (_variance(levels, sound, black_dn, rows, side) for side in SIDES)
+    apart = np.sqrt(max(small[1] ** 2 - large[1] ** 2, 0.0)) if np.isfinite(large[1]) else 0.0
+    return root_of(*(large if abs(large[0] - small[0]) < AGREE_SIGMAS * apart else small))
+
+
+class Level(NamedTuple):
+    """A level of light: its planes [half, pixel], DN, its signal, DN, and relative to it, the spread of offsets."""
+
+    planes: list[np.ndarray]
+    signal_dn: float
+    of_offsets: float
+
+
+def _saturates(highest: np.ndarray) -> bool:
+    return bool((highest == highest.max()).mean() > MOST_SATURATED)
+
+
+def _variance(levels: list[Level], sound: list[np.ndarray], black_dn: float, rows: float, side: int):
+    """Relative variance over pixels of the response, within blocks of this side, and its error; infinite without any.
+
+    sound [plane][pixel]: which pixels count; blocks with others do not.
+    """
+    whole = [within_blocks(np.stack([of, of]).astype(np.float32), rows, side)[1][0] == 1 for of in sound]
+    found, most = [], 0
+    for level in levels:
+        blocks = [within_blocks(of, rows, side) for of in level.planes]
+        signal = np.concatenate([mean.mean(0) for _, mean in blocks]) - black_dn
+        lit = np.concatenate(whole) & (signal > LEAST_LIT * level.signal_dn)
+        if not lit.any():
+            continue
+        apart = np.concatenate([values for values, _ in blocks], axis=1)[:, lit] / signal[lit, None]
+        variance, error = shared_variance(apart.reshape(2, -1))
+        found.append((variance - level.of_offsets**2, max(error * side / (side - 1), 1e-12)))
+        most = max(most, int(lit.sum()) * (side - 1) ** 2)
+    if not found:
+        return 0.0, np.inf
+    between = _between(*np.array(found).T)
     # Variances, not their roots, are averaged: a root of what may be negative is too large on average.
-    sigma, error = root_of(*weighted_mean([(of, float(np.hypot(error, apart))) for of, error in several]))
+    mean, error = weighted_mean([(of, float(np.hypot(error, between))) for of, error in found])
     # All levels show the same pixels: more of them do not make up for how few these are.
-    return sigma, max(error, sigma / float(np.sqrt(2 * max(contrasts))))
+    return mean, max(error, abs(mean) * float(np.sqrt(2 / most)))
 
 
 def _between(values: np.ndarray, errors: np.ndarray) -> float:

@@ -171,10 +171,15 @@ def row_gain_variance(flats: FlatMoments, signal, c: int) -> float:
 
 
 def row_gain_of(flats: FlatMoments, signal, c: int) -> tuple[float, float]:
-    """Variance of the row gain, from the scatter of row means beyond pixel noise, and its standard error."""
-    lit = signal > 0
-    if not lit.any():
+    """Variance of the row gain, from the scatter of row means beyond pixel noise, and its standard error.
+
+    Of the levels below saturation: in full pixels rows hardly scatter, whatever their gain.
+    """
+    lit = np.flatnonzero(signal > 0)
+    if not lit.size:
         return 0.0, np.inf
+    lit = lit[np.argsort(signal[lit], kind="stable")]
+    lit = lit[: _saturation(flats.variance_dn2[lit, c]) + 1]
     chance = flats.variance_dn2[lit, c] / flats.row_pixels[lit, c]
     relative = (flats.row_power_dn2[lit, c] - chance) / signal[lit] ** 2
     error = flats.row_power_dn2[lit, c] * np.sqrt(2 / flats.row_dof[lit, c]) / signal[lit] ** 2

@@ -8,9 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
+from hsnoise._core.types import cfa_tile
 from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
+from hsnoise.simulation.defects import without_defects
 from hsnoise.statistics.structure import check_size
 
 MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and draws slower
@@ -66,9 +68,10 @@ class Portion:
             part, chosen = part.select(exposures=kept_exposures), [chosen[i] for i in kept_exposures]
         counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
         check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
+        counts, of_defects = without_defects(counts, part.kind, len(cfa_tile(part.cfa)))
         # What depends on the place stays where it is on the sensor.
         window = part.window or ((0, first, rows, columns) if end - first < columns else None)
-        left_out = []
+        left_out = of_defects
         if single and "flat" in kinds:
             flats = f"{len(single)} flats of a single frame"
             left_out.append(f"{flats} were not compared: one frame cannot separate noise from light")

@@ -52,7 +52,8 @@ def test_only_what_is_described_is_called_right(row):
     assert np.isfinite([*numbers, *found.groups.values(), found.error, found.p_value, found.max_z_p_value]).all()
     assert np.isfinite([x for one in found.shares for x in one if isinstance(x, float)]).all()
     assert not NOT_FINITE.search(str(found))
-    assert not found.fits or MEASURED.get(row.name) in fit.params
+    left_out = any("stuck or dead" in sentence for sentence in found.skipped)
+    assert not found.fits or left_out or MEASURED.get(row.name) in fit.params
 
 
 @pytest.mark.parametrize("row", MARKED)

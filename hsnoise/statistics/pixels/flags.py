@@ -26,7 +26,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     flags[stuck] |= FLAGS["stuck"]
     lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     if lit:
-        flags[_dead(found, channel)] |= FLAGS["dead"]
+        flags[is_dead(found, channel)] |= FLAGS["dead"]
     flags[is_hot(found, channel)] |= FLAGS["hot"]
     flags[_jumping(found.repeated_darks, channel, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
@@ -37,26 +37,35 @@ def counts_of(flags: np.ndarray) -> dict[str, float]:
     return {name: float(np.mean(flags & bit > 0)) if flags.size else float("nan") for name, bit in FLAGS.items()}
 
 
-def _dead(found: Survey, channel: int) -> np.ndarray:
-    """Pixels that hardly respond to light, or lie where none falls, such as overscan.
+def is_dead(found: Survey, channel: int) -> np.ndarray:
+    """Pixels [pixel] that hardly respond to light, or lie where none falls, such as overscan.
 
     They are compared with their neighbours in the row: light may fall off by any factor over a frame.
     """
     flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
     level = [g.pixels(channel, "level_dn").mean(0) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
-    darks, frames = found.repeated_darks, flats[bright].n_frames
-    black, noise = np.zeros_like(level[bright]), 0.0
+    darks, noise = found.repeated_darks, flats[bright].noise_dn / np.sqrt(flats[bright].n_frames)
+    black = np.zeros_like(level[bright])
     if darks:
         black = darks[0].pixels(channel, "level_dn").mean(0)
-        noise = darks[0].noise_dn * np.sqrt(1 / frames + 1 / darks[0].n_frames)
+        noise = float(np.hypot(noise, darks[0].noise_dn / np.sqrt(darks[0].n_frames)))
     signal = level[bright] - black
     least = LIT_SIGMAS * noise
     if np.median(signal) < least:
         return np.zeros(len(signal), bool)
-    plane = found.groups[0].of(channel)[0]
-    nearby = of_neighbours(signal, len(plane.column_mean_dn))
-    return (signal < DIM * nearby) | ((nearby < least) & (signal < least))
+    width = len(found.groups[0].of(channel)[0].column_mean_dn)
+    nearby = of_neighbours(signal, width)
+    return are_dim(signal.reshape(-1, width), noise).ravel() | ((nearby < least) & (signal < least))
+
+
+def are_dim(signal: np.ndarray, noise: float) -> np.ndarray:
+    """Pixels [row, column] of one colour with less than half the signal of their row's neighbours, not by chance.
+
+    noise: standard deviation of a pixel's signal.
+    """
+    nearby = of_neighbours(signal.ravel(), signal.shape[1]).reshape(signal.shape)
+    return (signal < DIM * nearby) & (nearby > LIT_SIGMAS / DIM * noise)
 
 
 def _jumping(groups: tuple[Group, ...], channel: int, pixels: int) -> np.ndarray:

@@ -68,11 +68,19 @@ def double_differences(level: np.ndarray, rows: float) -> np.ndarray:
     return block.reshape(2, -1) / np.float32(2)
 
 
-def of_blocks(level: np.ndarray, rows: float) -> np.ndarray:
-    """Means of pixels [pixel], of so many rows, over the blocks of `double_differences` [block]."""
-    maps = level.reshape(int(rows), -1)
-    height, width = (size // 2 * 2 for size in maps.shape)
-    return maps[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3)).ravel()
+def within_blocks(level: np.ndarray, rows: float, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [half, block, pixel] of square blocks beyond their rows and columns, with a pixel's variance, and the
+    means of the blocks [half, block].
+
+    level [half, pixel]: of `rows` rows. Smooth shading, row and column patterns cancel, the better the smaller `side`;
+    (side - 1)^2 values of each block are independent.
+    """
+    maps = level.reshape(2, int(rows), -1)
+    height, width = (size // side * side for size in maps.shape[1:])
+    blocks = maps[:, :height, :width].reshape(2, height // side, side, width // side, side).swapaxes(2, 3)
+    mean = blocks.mean((3, 4), keepdims=True)
+    apart = blocks - blocks.mean(3, keepdims=True) - blocks.mean(4, keepdims=True) + mean
+    return apart.reshape(2, -1, side * side) * np.float32(side / (side - 1)), mean.reshape(2, -1)
 
 
 def beside_neighbours(level: np.ndarray, rows: float) -> np.ndarray:
