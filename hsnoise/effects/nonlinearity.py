@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
@@ -36,6 +37,12 @@ class Nonlinearity(AbstractEffect):
         summit = jnp.where(bends, 0.5 / jnp.where(bends, self.curvature, 1), jnp.inf)
         positive = jnp.clip(signal, 0, summit)
         return jnp.minimum(signal, summit) - self.curvature * positive**2
+
+    def before(self, signal_e: np.ndarray) -> np.ndarray:
+        """The electrons that read `signal_e`; beyond the summit, those of the summit."""
+        a = float(self.curvature)
+        root = np.sqrt(np.maximum(1 - 4 * a * np.maximum(signal_e, 0.0), 0.0))
+        return np.where(signal_e > 0, 2 * signal_e / (1 + root), signal_e)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:

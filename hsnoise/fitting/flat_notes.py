@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hsnoise._core.types import StatedGain
+from hsnoise.fitting.pixel_response import STRAIGHT, Bend
 from hsnoise.fitting.result import FitResult
 from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.flat_gain import LINE_RANGE, FlatGain, variance_curve
@@ -40,12 +43,15 @@ def flat_doubts(result: FitResult) -> list[str]:
     return doubts + _contradicted(found, flats, gain, channels)
 
 
-def gain_notes(found: FlatGain, flats: FlatMoments, channels: tuple[str, ...]) -> list[str]:
-    """Notes on the gain from flats."""
+def gain_notes(
+    found: FlatGain, flats: FlatMoments, channels: tuple[str, ...], bends: Sequence[Bend] | None = None
+) -> list[str]:
+    """Notes on the gain from flats; bends: what bends the curve of each channel, where pixels were followed."""
     notes = list(flats.set_aside)
     for c, channel in enumerate(channels):
-        for note in (_undetermined, _left_out, _bent):
+        for note in (_undetermined, _left_out):
             notes += note(found, c, _of(channel))
+        notes += _bent(found, c, _of(channel), STRAIGHT if bends is None else bends[c])
     return notes + scattered(found, channels) + _falling_black(found, flats)
 
 
@@ -108,14 +114,21 @@ def _left_out(found: FlatGain, c: int, of: str) -> list[str]:
     ]
 
 
-def _bent(found: FlatGain, c: int, of: str) -> list[str]:
+def _bent(found: FlatGain, c: int, of: str, bend: Bend) -> list[str]:
     if not found.bend[c].any():
         return []
-    off = float(variance_curve(found, c, found.full_scale_dn[c])) - 1
+    top = found.full_scale_dn[c]
+    off = float(variance_curve(found, c, top)) - 1
+    if bend.spreads:
+        return [
+            f"Variance over signal of the flats{of} falls by {-off:.1%} up to {top:.4g} DN, and neighbouring pixels"
+            f" share {bend.shared[0]:.1%}: electrons spread to neighbours as pixels fill (brighter-fatter effect). The"
+            " gain is that at low signal; no effect of the library spreads electrons."
+        ]
+    held = " (nonlinearity.curvature)" if np.isfinite(bend.curvature_per_e[1]) else ""
     return [
-        f"The response{of} bends: variance over signal changes by {off:+.1%} from low signal to"
-        f" {found.full_scale_dn[c]:.4g} DN, and the gain by about {off * 2 / 3:+.1%}. The gain is given for low"
-        " signal."
+        f"The response{of} bends{held}: variance over signal changes by {off:+.1%} from low signal to {top:.4g} DN,"
+        f" and the gain by about {off * 2 / 3:+.1%}. The gain is given for low signal."
     ]
 
 

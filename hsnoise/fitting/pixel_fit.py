@@ -15,12 +15,13 @@ from functools import partial
 import numpy as np
 
 from hsnoise.fitting.pixel_classes import classes_less
-from hsnoise.fitting.pixel_flats import linear_to_dn, photo_response
+from hsnoise.fitting.pixel_flats import photo_response
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
+from hsnoise.fitting.pixel_response import STRAIGHT, Bend, bend_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, row_gain_of_darks, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -70,6 +71,7 @@ class Channel:
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_spectrum: of what rows share in a frame.
         noise_spread: of the logarithm of read noise over pixels, rows and columns.
+        bend: of the response, from flats.
         photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
         warm: the warm pixels, if the darks have one exposure; else None.
         rays: hits of single frames; None if there are none.
@@ -95,6 +97,7 @@ class Channel:
     shading: Mapping[str, Shading]
     row_spectrum: RowSpectrum
     noise_spread: NoiseSpread
+    bend: Bend
     photo_response: tuple[float, float]
     warm: Warm | None
     rays: Rays | None
@@ -133,8 +136,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     flats = None if summary.flats is None else flat_gain(summary.flats)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
-    lit_dn = np.zeros(len(found.channels)) if told is None else linear_to_dn(told)
-    channels = [_channel(found, c, name, register, lit_dn[c]) for c, name in enumerate(found.channels)]
+    channels = [_channel(found, c, name, register, told) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
     estimate, covariance = joint_estimate(channels)
@@ -150,7 +152,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 
-def _channel(found: Survey, c: int, name: str, register: Multiplied | None, lit_dn: float) -> Channel:
+def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flats: FlatGain | None) -> Channel:
     (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
@@ -209,7 +211,8 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, lit_
         shading=shading,
         row_spectrum=spectrum,
         noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if is_plain else UNKNOWN_SPREAD,
-        photo_response=photo_response(found, c, black[0], offset[0], lit_dn),
+        bend=(bend := STRAIGHT if flats is None else bend_of(found, flats, c)),
+        photo_response=photo_response(found, c, black[0], offset[0], flats, bend),
         warm=warm,
         rays=rays,
         jumps=jumps,

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # its parts are imported when they are used
 
-from hsnoise.likelihood.flat_gain import FlatGain
+from hsnoise.fitting.pixel_response import Bend
+from hsnoise.likelihood.flat_gain import FlatGain, relative_slope
 from hsnoise.statistics.pixels.flags import is_dead
 from hsnoise.statistics.pixels.population import root_of, shared_variance
 from hsnoise.statistics.pixels.structure import plane_rows, within_blocks
@@ -22,25 +23,29 @@ MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 CONTRADICTION = 1e-3  # chance of levels of light that scatter so much beyond their errors
 
 
-def linear_to_dn(flats: FlatGain) -> np.ndarray:
-    """The brightest flat in the range that determines the gain, DN above black [channel]."""
-    return np.where(flats.used, flats.signal_dn, 0.0).max(0)
-
-
-def photo_response(found: Survey, c: int, black_dn: float, offset_dn: float, lit_dn: float) -> tuple[float, float]:
+def photo_response(
+    found: Survey, c: int, black_dn: float, offset_dn: float, flats: FlatGain | None, bend: Bend
+) -> tuple[float, float]:
     """Relative standard deviation of the pixels' response to light (PRNU), and its error, within blocks of pixels.
 
-    From flats up to `lit_dn` that do not saturate: charge that spills over evens out pixels that are nearly full. Dust
-    and vignetting hardly vary within a block, whose own signal counts; if they vary within the large ones, the small
-    ones count. Dead and stuck pixels are left out. Without flats, the error is infinite. If the levels disagree, it
-    holds their scatter.
+    From flats of the range that determines the gain: charge that spills over evens out pixels that are nearly full. A
+    response that bends evens them out, too, which is taken off. Dust and vignetting hardly vary within a block, whose
+    own signal counts; if they vary within the large ones, the small ones count. Dead and stuck pixels are left out.
+    Without flats, the error is infinite. If the levels disagree, it holds their scatter.
     """
-    several = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
-    signals = [float(np.mean([p.row_mean_dn.mean() for p in g.of(c)])) - black_dn for g in several]
+    if flats is None:
+        return 0.0, np.inf
+    brightest = np.where(flats.used[:, c], flats.signal_dn[:, c], 0.0).max()
+    signals = [float(np.mean([p.row_mean_dn.mean() for p in g.of(c)])) - black_dn for g in found.repeated_flats]
     levels = [
-        Level([p.halves.level_dn for p in g.of(c)], signal, offset_dn / signal)
-        for g, signal in zip(several, signals, strict=True)
-        if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * lit_dn and not _saturates(g.pixels(c, "highest"))
+        Level(
+            [p.halves.level_dn for p in g.of(c)],
+            signal,
+            offset_dn / signal,
+            float(relative_slope(flats, c, signal)) if np.isfinite(bend.curvature_per_e[1]) else 1.0,
+        )
+        for g, signal in zip(found.repeated_flats, signals, strict=True)
+        if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * brightest and not _saturates(g.pixels(c, "highest"))
     ]
     if not levels:
         return 0.0, np.inf
@@ -52,11 +57,13 @@ def photo_response(found: Survey, c: int, black_dn: float, offset_dn: float, lit
 
 
 class Level(NamedTuple):
-    """A level of light: its planes [half, pixel], DN, its signal, DN, and relative to it, the spread of offsets."""
+    """A level of light: its planes [half, pixel], DN, its signal, DN, relative to it, the spread of offsets, and by how
+    much pixels of more light read more, relative to both."""
 
     planes: list[np.ndarray]
     signal_dn: float
     of_offsets: float
+    slope: float
 
 
 def _saturates(highest: np.ndarray) -> bool:
@@ -78,7 +85,8 @@ def _variance(levels: list[Level], sound: list[np.ndarray], black_dn: float, row
             continue
         apart = np.concatenate([values for values, _ in blocks], axis=1)[:, lit] / signal[lit, None]
         variance, error = shared_variance(apart.reshape(2, -1))
-        found.append((variance - level.of_offsets**2, max(error * side / (side - 1), 1e-12)))
+        variance, error = variance - level.of_offsets**2, error * side / (side - 1)
+        found.append((variance / level.slope**2, max(error / level.slope**2, 1e-12)))
         most = max(most, int(lit.sum()) * (side - 1) ** 2)
     if not found:
         return 0.0, np.inf

@@ -24,6 +24,7 @@ from hsnoise.effects import (
     FrameOffset,
     HotPixels,
     MissingCodes,
+    Nonlinearity,
     OddEvenPattern,
     PeriodicBanding,
     PhotoResponseNonuniformity,
@@ -41,6 +42,7 @@ from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
+from hsnoise.fitting.pixel_response import FEWEST_LEVELS
 from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
@@ -63,6 +65,7 @@ OF_PIXELS = (
     HotPixels,
     ReadNoiseNonuniformity,
     PhotoResponseNonuniformity,
+    Nonlinearity,
     FrameOffset,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -90,7 +93,8 @@ BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_l
 
 def followed(found: Survey) -> set[str]:
     """Names of the effects beyond the paper's that a fit of these frames measures when it follows each pixel."""
-    return {effect.name for effect in OF_PIXELS if effect is not ElectronMultiplication or has_register(found)}
+    unseen = {ElectronMultiplication: not has_register(found), Nonlinearity: len(found.repeated_flats) < FEWEST_LEVELS}
+    return {effect.name for effect in OF_PIXELS if not unseen.get(effect)}
 
 
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
@@ -193,6 +197,9 @@ def _population(
         found |= effects_of(register)
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
+    curvature = of_colours([c.bend.curvature_per_e for c in pixel.channels])
+    if abs(curvature[0]) > THERE * curvature[1]:
+        found["nonlinearity"] = {"curvature": curvature}
     response = of_colours([c.photo_response for c in pixel.channels])
     if response[0] > max(THERE * response[1], LEAST_RESPONSE):
         found["photo_response_nonuniformity"] = {"sigma": response}

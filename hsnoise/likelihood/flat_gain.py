@@ -272,3 +272,8 @@ def local_gain(found: FlatGain, c: int, signal_dn) -> np.ndarray:
     rate = found.gain[c] * variance_curve(found, c, u**2)
     root_e = np.sqrt(signal) / 2 * (weights / np.sqrt(rate)).sum(-1)
     return np.sqrt(found.gain[c] * variance_curve(found, c, signal) * signal) / np.maximum(root_e, 1e-300)
+
+
+def relative_slope(found: FlatGain, c: int, signal_dn) -> np.ndarray:
+    """By how much pixels of more light read more, relative to both [signal]: 1 where the response is straight."""
+    return found.gain[c] * variance_curve(found, c, signal_dn) / local_gain(found, c, signal_dn)

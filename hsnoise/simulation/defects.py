@@ -36,8 +36,7 @@ def without_defects(counts: Sequence[np.ndarray], kind: Sequence[str], tile: int
     if share > MOST:
         return list(counts), [f"{what}: too many to be left out"]
     source = _sources(bad)
-    found = bad & (source != np.arange(bad.shape[1]))
-    rows, columns = np.nonzero(found)
+    rows, columns = np.nonzero(bad)
     out = [some.copy() for some in counts]
     for some in out:
         some[:, rows, columns] = some[:, rows, source[rows, columns]]

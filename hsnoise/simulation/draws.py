@@ -97,8 +97,10 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
     level = _illumination_dn(like, exposure)
     if "measured_response" in model:
         level = model["measured_response"].before(level)
-    above_black = level - black_level_of(model)[channel]
-    return np.maximum(above_black / np.asarray(model["gain"].value)[channel] - dark_e, 0.0).astype(np.float32)
+    signal_e = (level - black_level_of(model)[channel]) / np.asarray(model["gain"].value)[channel]
+    if "nonlinearity" in model:
+        signal_e = model["nonlinearity"].before(signal_e)
+    return np.maximum(signal_e - dark_e, 0.0).astype(np.float32)
 
 
 @lru_cache(maxsize=32)

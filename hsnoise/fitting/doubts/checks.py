@@ -336,8 +336,10 @@ def _outliers(result: FitResult) -> Iterator[str]:
 
 
 def _of_flats(result: FitResult) -> list[str]:
-    flats = result.transfer.flats
-    return [] if flats is None else gain_notes(flats, result.summary.flats, result.summary.channels)
+    pixel = result.transfer
+    if pixel.flats is None:
+        return []
+    return gain_notes(pixel.flats, result.summary.flats, result.summary.channels, [one.bend for one in pixel.channels])
 
 
 def _of_neighbours(result: FitResult) -> Iterator[str]:

@@ -24,8 +24,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     flags = np.zeros(sum(h.level_dn.shape[1] for h in halves[0]), np.uint8)
     stuck = found.stuck(channel)
     flags[stuck] |= FLAGS["stuck"]
-    lit = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
-    if lit:
+    if found.repeated_flats:
         flags[is_dead(found, channel)] |= FLAGS["dead"]
     flags[is_hot(found, channel)] |= FLAGS["hot"]
     flags[_jumping(found.repeated_darks, channel, len(flags)) & ~stuck] |= FLAGS["telegraph"]
@@ -42,7 +41,7 @@ def is_dead(found: Survey, channel: int) -> np.ndarray:
 
     They are compared with their neighbours in the row: light may fall off by any factor over a frame.
     """
-    flats = [g for g in found.groups if g.kind == "flat" and g.n_frames > 1]
+    flats = found.repeated_flats
     level = [g.pixels(channel, "level_dn").mean(0) for g in flats]
     bright = int(np.argmax([np.median(x) for x in level]))
     darks, noise = found.repeated_darks, flats[bright].noise_dn / np.sqrt(flats[bright].n_frames)

@@ -151,6 +151,11 @@ class Survey:
         return tuple(group for group in self.darks if group.n_frames > 1)
 
     @property
+    def repeated_flats(self) -> tuple[Group, ...]:
+        """The levels of light of two or more frames."""
+        return tuple(group for group in self.groups if group.kind == "flat" and group.n_frames > 1)
+
+    @property
     def along(self) -> list[Along]:
         """What pixels share along rows, of the groups that show it."""
         return [group.along for group in self.groups if group.along is not None]

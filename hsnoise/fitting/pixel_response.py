@@ -1,0 +1,104 @@
+"""A response that bends, from the photon transfer of flats: electrons that spread to neighbours bend that, too."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hsnoise.likelihood.flat_gain import FlatGain, variance_curve
+from hsnoise.statistics.pixels.structure import plane_rows
+from hsnoise.statistics.pixels.survey import Group, Survey
+
+FEWEST_LEVELS = 4  # a line goes through two, and a third is not enough to tell a bend
+ABOVE_TOP = 1.01  # black levels that were reckoned apart
+SURE = 2.0  # standard errors
+MOST_SHARED = 0.4  # of the variance that is missing: if neighbours share more, electrons have spread
+
+
+class Bend(NamedTuple):
+    """The curve of a colour's variance, and what makes it.
+
+    curvature_per_e: relative loss of response for each electron of signal, and its error; infinite if there is none.
+    missing: relative change of variance over signal up to the brightest level that determines the gain.
+    shared: part of the variance there that neighbours have come to share since low signal, and its error.
+    """
+
+    curvature_per_e: tuple[float, float]
+    missing: float
+    shared: tuple[float, float]
+
+    @property
+    def spreads(self) -> bool:
+        """Whether electrons spread to neighbours as pixels fill (brighter-fatter effect): the response is straight."""
+        return self.shared[0] > max(SURE * self.shared[1], -MOST_SHARED * self.missing)
+
+
+STRAIGHT = Bend((0.0, np.inf), 0.0, (0.0, np.inf))
+
+
+def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
+    """The bend of channel c, from flats of four levels or more.
+
+    A response x - a x^2 has the variance gain^2 (1 - 2 a x)^2 x. Electrons that spread to neighbours take variance,
+    too, but leave it in the covariance with them.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007 (nonlinearity); Antilogus et al., "The brighter-fatter effect and
+    pixel correlations in CCD sensors", JINST 9 C03048 (2014).
+    """
+    used = flats.used[:, c]
+    if not flats.described[c] or not flats.bend[c].any() or used.sum() < FEWEST_LEVELS:
+        return STRAIGHT
+    top_dn, gain = float(flats.signal_dn[used, c].max()), float(flats.gain[c])
+    missing = float(variance_curve(flats, c, top_dn)) - 1
+    # (1 - 2 u)^2 / (1 - u) = 1 + missing, of u = a x at the brightest level.
+    at_top = (3 - missing - np.sqrt((3 - missing) ** 2 + 16 * missing)) / 8
+    curvature = at_top * (1 - at_top) * gain / top_dn
+    one = flats.bend[c, 1] == 0
+    brightest = np.flatnonzero(used)[flats.signal_dn[used, c].argmax()]
+    of_top = flats.level_error[brightest, c] / flats.level_gain[brightest, c]
+    error = flats.bend_error[c, 0] if one else np.hypot(of_top, flats.standard_error[c] / gain)
+    bend = Bend((curvature, abs(curvature / missing) * float(error)), missing, _shared(found, c, top_dn))
+    return bend._replace(curvature_per_e=STRAIGHT.curvature_per_e) if bend.spreads else bend
+
+
+def _shared(found: Survey, c: int, top_dn: float) -> tuple[float, float]:
+    """By how much more of its variance a pixel shares with its neighbours at a signal of `top_dn` than at none.
+
+    Its error is infinite with fewer than three levels.
+    """
+    if not found.repeated_darks:
+        return 0.0, np.inf
+    black = _mean_dn(found.repeated_darks[0], c)
+    signals = [_mean_dn(group, c) - black for group in found.repeated_flats]
+    lit = [i for i, signal in enumerate(signals) if 0 < signal < ABOVE_TOP * top_dn]
+    if len(lit) < 3:
+        return 0.0, np.inf
+    share, error = np.array([_with_neighbours(found.repeated_flats[i], c, found) for i in lit]).T
+    slope, covariance = np.polyfit(np.array(signals)[lit] / top_dn, share, 1, w=1 / error, cov="unscaled")
+    return float(slope[0]), float(np.sqrt(covariance[0, 0]))
+
+
+def _mean_dn(group: Group, c: int) -> float:
+    return float(np.mean([plane.row_mean_dn.mean() for plane in group.of(c)]))
+
+
+def _with_neighbours(group: Group, c: int, found: Survey) -> tuple[float, float]:
+    """Sum of the correlations of a pixel's noise with the next ones of its colour on all four sides, and its error.
+
+    Rows that are not next to each other tell nothing of rows: both directions count as columns then.
+    """
+    rows = len(found.sampled_rows) * plane_rows(found)
+    adjacent = len(found.sampled_rows) == found.shape[0]
+    several = []
+    for plane in group.of(c):
+        level = plane.halves.level_dn
+        noise = (level[0] - level[1]).astype(np.float64).reshape(int(rows), -1)
+        low, high = np.quantile(noise, (0.001, 0.999))
+        noise = np.clip(noise, low, high)
+        noise -= noise.mean()
+        across = (noise[:, 1:] * noise[:, :-1]).mean()
+        down = (noise[1:] * noise[:-1]).mean() if adjacent and rows > 1 else across
+        several.append(2 * (across + down) / noise.var())
+    pixels = sum(plane.halves.level_dn.shape[1] for plane in group.of(c))
+    return float(np.mean(several)), float((2 if adjacent else 4) * np.sqrt((2 if adjacent else 1) / pixels))
