@@ -14,6 +14,7 @@ from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, co
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
 from hsnoise.fitting.notes import closing_notes, outlier_fraction
+from hsnoise.fitting.pixel_flats import responses_differ
 from hsnoise.fitting.pixel_register import has_register
 from hsnoise.fitting.pixel_result import followed, result_of
 from hsnoise.fitting.problem import check_named
@@ -227,16 +228,15 @@ def _surveyed(stack) -> Survey:
 
 def _all_of(stack, found: Survey) -> Survey:
     """The survey of the whole stack; `found` if that already covers it."""
-    whole = found.shape == stack.shape and max(stack.n_frames) <= PROBE_FRAMES
-    return found if whole else survey(stack)
+    return found if found.shape == stack.shape and max(stack.n_frames) <= PROBE_FRAMES else survey(stack)
 
 
 def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
     """Whether the fit is conditional on the pixel."""
-    if method == "transfer" or pixels == "differ":
-        return True
-    needed = (pixels_differ(found) or rows_dominate(found)) and can_be_transferred(found)
-    return method != "line" and pixels == "auto" and (needed or has_register(found))
+    if (always := method == "transfer" or pixels == "differ") or method == "line" or pixels == "alike":
+        return always
+    needed = pixels_differ(found) or rows_dominate(found) or responses_differ(found)
+    return (needed and can_be_transferred(found)) or has_register(found)
 
 
 def _check_size(stack) -> None:

@@ -250,3 +250,21 @@ def test_the_gain_of_real_flats(shared_data, name, low, high):
     notes = " ".join(gain_notes(found, moments, ("mono",)))
     if name == "site_2k_ccd":
         assert "The black level falls with the signal" in notes and "near saturation" in notes
+
+
+def test_pixels_that_differ_in_light_alone_are_measured(rng):
+    """Nothing differed in the darks, so the photo response was left out: `compare` of a right gain ended at 9800."""
+    response = 1 + 0.008 * rng.standard_normal((192, 256))
+
+    def frames(light_e, seconds, n):
+        electrons = rng.poisson(light_e * response + 20 * seconds, (n, *response.shape))
+        return np.rint(BLACK_DN + GAIN * (electrons + READ_E * rng.standard_normal(electrons.shape))).astype(np.uint16)
+
+    darks = [frames(0, t, 6) for t in (0.0, 5.0, 20.0)]
+    flats = [frames(light, 0, 4) for light in (800, 1600, 2800, 4000, 5200)]
+    kind, exposure_s = ["dark"] * 3 + ["flat"] * 5, [0.0, 5.0, 20.0, 0.01, 0.02, 0.035, 0.05, 0.065]
+    stack = FrameStack([*darks, *flats], exposure_s, kind=kind, shutter="global")
+    fit = hsnoise.fit(stack)
+    value, error, _ = fit.table["photo_response_nonuniformity.sigma"]
+    assert abs(value - 0.008) < 4 * error < 3e-4
+    assert hsnoise.compare(fit, stack, draws=20).error < 3

@@ -14,6 +14,7 @@ from hsnoise.effects.amplifier_glow import AmplifierGlow
 from hsnoise.effects.black_clamp import BlackClamp
 from hsnoise.effects.black_level import BlackLevel
 from hsnoise.effects.black_shading import BlackShading
+from hsnoise.effects.brighter_fatter import BrighterFatter
 from hsnoise.effects.column_fixed_pattern import ColumnFixedPattern
 from hsnoise.effects.column_noise import ColumnNoise
 from hsnoise.effects.correlated_read_noise import CorrelatedReadNoise
@@ -88,6 +89,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     CorrelatedReadNoise,
     PeriodicBanding,
     Crosstalk,
+    BrighterFatter,
     ReadoutBandwidth,
     ReadoutOvershoot,
     ImageLag,
@@ -116,6 +118,7 @@ __all__ = [
     "BlackClamp",
     "BlackLevel",
     "BlackShading",
+    "BrighterFatter",
     "Capture",
     "CaptureFacts",
     "ColumnFixedPattern",

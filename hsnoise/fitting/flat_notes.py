@@ -119,16 +119,17 @@ def _bent(found: FlatGain, c: int, of: str, bend: Bend) -> list[str]:
         return []
     top = found.full_scale_dn[c]
     off = float(variance_curve(found, c, top)) - 1
+    gain = "The gain is given for low signal."
     if bend.spreads:
+        rest = "; the response bends, too (nonlinearity.curvature)" if bend.is_curved else ""
         return [
-            f"Variance over signal of the flats{of} falls by {-off:.1%} up to {top:.4g} DN, and neighbouring pixels"
-            f" share {bend.shared[0]:.1%}: electrons spread to neighbours as pixels fill (brighter-fatter effect). The"
-            " gain is that at low signal; no effect of the library spreads electrons."
+            f"Variance over signal of the flats{of} changes by {off:+.1%} up to {top:.4g} DN, and neighbouring pixels"
+            f" share {bend.shared:.1%} of it: electrons spread as pixels fill (brighter_fatter){rest}. {gain}"
         ]
-    held = " (nonlinearity.curvature)" if np.isfinite(bend.curvature_per_e[1]) else ""
+    held = " (nonlinearity.curvature)" if bend.is_curved else ""
     return [
         f"The response{of} bends{held}: variance over signal changes by {off:+.1%} from low signal to {top:.4g} DN,"
-        f" and the gain by about {off * 2 / 3:+.1%}. The gain is given for low signal."
+        f" and the gain by about {off * 2 / 3:+.1%}. {gain}"
     ]
 
 

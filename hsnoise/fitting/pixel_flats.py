@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # its parts are imported when they are used
 
 from hsnoise.fitting.pixel_response import Bend
-from hsnoise.likelihood.flat_gain import FlatGain, relative_slope
+from hsnoise.likelihood.flat_gain import FlatGain, relative_slope, variance_curve
 from hsnoise.statistics.pixels.flags import is_dead
 from hsnoise.statistics.pixels.population import root_of, shared_variance
 from hsnoise.statistics.pixels.structure import plane_rows, within_blocks
@@ -18,7 +18,9 @@ LEAST_SIGNAL_DN = 1.0  # of a flat: with less, rounding is all that differs
 LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
 SAME_LIGHT = 1.01  # signals of one level above black levels that were reckoned apart
 SIDES = 2, 8  # pixels of a block
-AGREE_SIGMAS = 2.0  # between what small and large blocks show
+MORE_SIGMAS = 2.0  # by which large blocks may show more: it is light that varies within them
+SURELY = 5.0  # standard errors
+LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 CONTRADICTION = 1e-3  # chance of levels of light that scatter so much beyond their errors
 
@@ -29,9 +31,9 @@ def photo_response(
     """Relative standard deviation of the pixels' response to light (PRNU), and its error, within blocks of pixels.
 
     From flats of the range that determines the gain: charge that spills over evens out pixels that are nearly full. A
-    response that bends evens them out, too, which is taken off. Dust and vignetting hardly vary within a block, whose
-    own signal counts; if they vary within the large ones, the small ones count. Dead and stuck pixels are left out.
-    Without flats, the error is infinite. If the levels disagree, it holds their scatter.
+    response that bends and electrons that spread even them out, too, which is taken off. Dust and vignetting hardly
+    vary within a block, whose own signal counts; if they vary within the large ones, the small ones count. Dead and
+    stuck pixels are left out. Without flats, the error is infinite. If the levels disagree, it holds their scatter.
     """
     if flats is None:
         return 0.0, np.inf
@@ -42,7 +44,7 @@ def photo_response(
             [p.halves.level_dn for p in g.of(c)],
             signal,
             offset_dn / signal,
-            float(relative_slope(flats, c, signal)) if np.isfinite(bend.curvature_per_e[1]) else 1.0,
+            *_evened(flats, c, bend, signal),
         )
         for g, signal in zip(found.repeated_flats, signals, strict=True)
         if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * brightest and not _saturates(g.pixels(c, "highest"))
@@ -53,17 +55,43 @@ def photo_response(
     rows = len(found.sampled_rows) * plane_rows(found)
     small, large = (_variance(levels, sound, black_dn, rows, side) for side in SIDES)
     apart = np.sqrt(max(small[1] ** 2 - large[1] ** 2, 0.0)) if np.isfinite(large[1]) else 0.0
-    return root_of(*(large if abs(large[0] - small[0]) < AGREE_SIGMAS * apart else small))
+    return root_of(*(large if large[0] - small[0] < MORE_SIGMAS * apart else small))
+
+
+def _evened(flats: FlatGain, c: int, bend: Bend, signal_dn: float) -> tuple[float, float]:
+    """The factor by which a bend of the response, or electrons that spread, even out pixels at this signal, and the
+    correlation with each of the four neighbours that they leave."""
+    if not bend.spreads:
+        return (float(relative_slope(flats, c, signal_dn)) if bend.is_curved else 1.0), 0.0
+    share = bend.spread_per_e[0] * signal_dn / float(flats.gain[c])
+    variance = float(variance_curve(flats, c, signal_dn))
+    return float(np.sqrt(variance)), 2 * share * (1 - 4 * share) / variance
+
+
+def responses_differ(found: Survey) -> bool:
+    """Whether pixels of some colour differ in what they add to a level of light, by more than chance."""
+    rows = len(found.sampled_rows) * plane_rows(found)
+    for group in found.repeated_flats:
+        for c in range(len(found.channels)):
+            if _saturates(group.pixels(c, "highest")):
+                continue
+            signal = np.mean([plane.row_mean_dn.mean() for plane in group.of(c)])
+            blocks = [within_blocks(plane.halves.level_dn, rows, SIDES[0])[0] for plane in group.of(c)]
+            variance, error = shared_variance(np.concatenate(blocks, axis=1).reshape(2, -1))
+            if variance > max(SURELY * error * SIDES[0], (LEAST_RESPONSE * signal) ** 2):
+                return True
+    return False
 
 
 class Level(NamedTuple):
-    """A level of light: its planes [half, pixel], DN, its signal, DN, relative to it, the spread of offsets, and by how
-    much pixels of more light read more, relative to both."""
+    """A level of light: its planes [half, pixel], DN, its signal, DN, relative to it, the spread of offsets, and of
+    the differences of pixels the factor by which they are evened out and the correlation of neighbours."""
 
     planes: list[np.ndarray]
     signal_dn: float
     of_offsets: float
-    slope: float
+    evened: float
+    alike: float
 
 
 def _saturates(highest: np.ndarray) -> bool:
@@ -85,8 +113,9 @@ def _variance(levels: list[Level], sound: list[np.ndarray], black_dn: float, row
             continue
         apart = np.concatenate([values for values, _ in blocks], axis=1)[:, lit] / signal[lit, None]
         variance, error = shared_variance(apart.reshape(2, -1))
-        variance, error = variance - level.of_offsets**2, error * side / (side - 1)
-        found.append((variance / level.slope**2, max(error / level.slope**2, 1e-12)))
+        # Rows and columns of a block take more of a pattern in which neighbours are alike.
+        seen = level.evened**2 * (1 - 4 * level.alike / side)
+        found.append(((variance - level.of_offsets**2) / seen, max(error * side / (side - 1) / seen, 1e-12)))
         most = max(most, int(lit.sum()) * (side - 1) ** 2)
     if not found:
         return 0.0, np.inf

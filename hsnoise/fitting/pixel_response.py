@@ -13,35 +13,43 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 FEWEST_LEVELS = 4  # a line goes through two, and a third is not enough to tell a bend
 ABOVE_TOP = 1.01  # black levels that were reckoned apart
 SURE = 2.0  # standard errors
-MOST_SHARED = 0.4  # of the variance that is missing: if neighbours share more, electrons have spread
+LEAST_SHARED = 0.1  # of the variance that is missing
+NONE = (0.0, np.inf)
 
 
 class Bend(NamedTuple):
-    """The curve of a colour's variance, and what makes it.
+    """What bends the curve of a colour's variance.
 
     curvature_per_e: relative loss of response for each electron of signal, and its error; infinite if there is none.
-    missing: relative change of variance over signal up to the brightest level that determines the gain.
-    shared: part of the variance there that neighbours have come to share since low signal, and its error.
+    spread_per_e: share of its excess that a pixel gives each neighbour, for each electron, likewise.
+    shared: part of the variance at the brightest level that determines the gain that neighbours have come to share
+        since low signal.
     """
 
-    curvature_per_e: tuple[float, float]
-    missing: float
-    shared: tuple[float, float]
+    curvature_per_e: tuple[float, float] = NONE
+    spread_per_e: tuple[float, float] = NONE
+    shared: float = 0.0
 
     @property
     def spreads(self) -> bool:
-        """Whether electrons spread to neighbours as pixels fill (brighter-fatter effect): the response is straight."""
-        return self.shared[0] > max(SURE * self.shared[1], -MOST_SHARED * self.missing)
+        """Whether electrons spread to neighbours as pixels fill (brighter-fatter effect)."""
+        return bool(np.isfinite(self.spread_per_e[1]))
+
+    @property
+    def is_curved(self) -> bool:
+        """Whether the response bends."""
+        return bool(np.isfinite(self.curvature_per_e[1]))
 
 
-STRAIGHT = Bend((0.0, np.inf), 0.0, (0.0, np.inf))
+STRAIGHT = Bend()
 
 
 def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
     """The bend of channel c, from flats of four levels or more.
 
     A response x - a x^2 has the variance gain^2 (1 - 2 a x)^2 x. Electrons that spread to neighbours take variance,
-    too, but leave it in the covariance with them.
+    too, but leave it in the covariance with them: what neighbours share is theirs, and the rest is the response's, or
+    chance.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (nonlinearity); Antilogus et al., "The brighter-fatter effect and
     pixel correlations in CCD sensors", JINST 9 C03048 (2014).
@@ -51,15 +59,31 @@ def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
         return STRAIGHT
     top_dn, gain = float(flats.signal_dn[used, c].max()), float(flats.gain[c])
     missing = float(variance_curve(flats, c, top_dn)) - 1
-    # (1 - 2 u)^2 / (1 - u) = 1 + missing, of u = a x at the brightest level.
-    at_top = (3 - missing - np.sqrt((3 - missing) ** 2 + 16 * missing)) / 8
-    curvature = at_top * (1 - at_top) * gain / top_dn
-    one = flats.bend[c, 1] == 0
     brightest = np.flatnonzero(used)[flats.signal_dn[used, c].argmax()]
     of_top = flats.level_error[brightest, c] / flats.level_gain[brightest, c]
-    error = flats.bend_error[c, 0] if one else np.hypot(of_top, flats.standard_error[c] / gain)
-    bend = Bend((curvature, abs(curvature / missing) * float(error)), missing, _shared(found, c, top_dn))
-    return bend._replace(curvature_per_e=STRAIGHT.curvature_per_e) if bend.spreads else bend
+    is_line = flats.bend[c, 1] == 0
+    error = float(flats.bend_error[c, 0] if is_line else np.hypot(of_top, flats.standard_error[c] / gain))
+    shared, of_shared = _shared(found, c, top_dn)
+    per_e = gain / top_dn
+    together = float(np.hypot(error, of_shared)) if np.isfinite(of_shared) else error
+    if shared <= max(SURE * of_shared, -LEAST_SHARED * missing):
+        return Bend(_curved(missing, together, per_e), NONE, shared)
+    rest = (1 + missing) / (1 - shared + 20 * (shared / 8) ** 2) - 1
+    if abs(rest) < SURE * together and missing < 0:
+        return Bend(NONE, _spread(missing, error, per_e), shared)
+    return Bend(_curved(rest, together, per_e), (shared / 8 * per_e, of_shared / 8 * per_e), shared)
+
+
+def _curved(missing: float, error: float, per_e: float) -> tuple[float, float]:
+    """Curvature: (1 - 2 u)^2 / (1 - u) = 1 + missing, with u of the response missing at the brightest level."""
+    u = (3 - missing - np.sqrt((3 - missing) ** 2 + 16 * missing)) / 8
+    return float(u * (1 - u) * per_e), float(abs(u / missing) * error * per_e)
+
+
+def _spread(missing: float, error: float, per_e: float) -> tuple[float, float]:
+    """Share that goes to a neighbour: (1 - 4 k)^2 + 4 k^2 = 1 + missing at the brightest level."""
+    k = (8 - np.sqrt(max(64 + 80 * missing, 0.0))) / 40
+    return float(k * per_e), float(k / -missing * error * per_e)
 
 
 def _shared(found: Survey, c: int, top_dn: float) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from hsnoise.effects import (
     AmplifierGlow,
     BlackClamp,
     BlackShading,
+    BrighterFatter,
     ColumnFixedPattern,
     ColumnNoise,
     CorrelatedReadNoise,
@@ -39,6 +40,7 @@ from hsnoise.effects import (
 )
 from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_colours, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
+from hsnoise.fitting.pixel_flats import LEAST_RESPONSE
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
@@ -56,6 +58,7 @@ from hsnoise.statistics.pixels.transfer import ROUNDING
 NOMINAL = 50.0  # relative standard error of an unknown gain
 
 THERE = 5.0  # standard errors above which a population effect enters the model
+BENT = 2.0  # the same of what bends the curve of the variance, beside the test of the curve
 SUBTRACTED = 2.0  # the same of a dark signal that is subtracted, where pedestals or levels have moved beyond chance
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
@@ -66,6 +69,7 @@ OF_PIXELS = (
     ReadNoiseNonuniformity,
     PhotoResponseNonuniformity,
     Nonlinearity,
+    BrighterFatter,
     FrameOffset,
     RowFixedPattern,
     ColumnFixedPattern,
@@ -87,13 +91,13 @@ OF_PIXELS = (
     ElectronMultiplication,
 )
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
-LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
 BASE = ("shot_noise", "dark_current", "read_noise", "row_gain", "gain", "black_level", "adc")
 
 
 def followed(found: Survey) -> set[str]:
     """Names of the effects beyond the paper's that a fit of these frames measures when it follows each pixel."""
-    unseen = {ElectronMultiplication: not has_register(found), Nonlinearity: len(found.repeated_flats) < FEWEST_LEVELS}
+    few = len(found.repeated_flats) < FEWEST_LEVELS
+    unseen = {ElectronMultiplication: not has_register(found), Nonlinearity: few, BrighterFatter: few}
     return {effect.name for effect in OF_PIXELS if not unseen.get(effect)}
 
 
@@ -197,9 +201,7 @@ def _population(
         found |= effects_of(register)
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
-    curvature = of_colours([c.bend.curvature_per_e for c in pixel.channels])
-    if abs(curvature[0]) > THERE * curvature[1]:
-        found["nonlinearity"] = {"curvature": curvature}
+    found |= _bends(pixel)
     response = of_colours([c.photo_response for c in pixel.channels])
     if response[0] > max(THERE * response[1], LEAST_RESPONSE):
         found["photo_response_nonuniformity"] = {"sigma": response}
@@ -212,6 +214,13 @@ def _population(
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
     return found | hot_of(pixel, many)
+
+
+def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
+    """What bends the photon transfer curve, if it does in all colours; that it does is known from the curve itself."""
+    curvature, spread = (of_colours(list(of)) for of in zip(*(c.bend[:2] for c in pixel.channels), strict=True))
+    found = {"nonlinearity": {"curvature": curvature}} if abs(curvature[0]) > BENT * curvature[1] else {}
+    return found | ({"brighter_fatter": {"strength": spread}} if spread[0] > BENT * spread[1] else {})
 
 
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:

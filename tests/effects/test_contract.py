@@ -24,6 +24,7 @@ from hsnoise.effects import (
     BlackClamp,
     BlackLevel,
     BlackShading,
+    BrighterFatter,
     Capture,
     ColumnFixedPattern,
     ColumnNoise,
@@ -108,6 +109,7 @@ EXAMPLES = [
     CorrelatedReadNoise(0.3, 0.5, 0.4),
     PeriodicBanding(2.0, 0.13),
     Crosstalk(0.03),
+    BrighterFatter(1e-4),
     ReadoutBandwidth(0.1),
     ReadoutOvershoot(0.1),
     ImageLag(0.1),
@@ -134,6 +136,7 @@ DETERMINISTIC = (
     Gain
     | BlackLevel
     | ADC
+    | BrighterFatter
     | Crosstalk
     | ReadoutBandwidth
     | ReadoutOvershoot
