@@ -466,3 +466,17 @@ def test_noise_that_is_less_than_a_step_of_the_codes_is_no_result(rng):
     ]
     fit = hsnoise.fit((64 * np.round(np.array(darks) / 64)).astype(np.uint16), exposure_s=(0.01, 20.0, 60.0))
     assert fit.grave and any("divide counts and levels by 64" in doubt for doubt in fit.doubts)
+
+
+def test_offsets_of_pixels_that_are_alike_in_dn_are_so_in_the_model(rng):
+    """They were taken as alike in electrons: those of green came out 18 % too small, 8 of their errors, in green."""
+    shape, gain, offset_dn = (96, 128), np.tile([[0.65, 0.5], [0.5, 0.8]], (48, 64)), 2.0
+    black = 64 + offset_dn * rng.standard_normal(shape)
+    darks = np.rint(black + gain * 4.0 * rng.standard_normal((8, *shape))).astype(np.uint16)
+    lit = [rng.poisson(light, (4, *shape)) + 4.0 * rng.standard_normal((4, *shape)) for light in (500, 1000, 2000)]
+    flats = [np.rint(black + gain * of).astype(np.uint16) for of in lit]
+    kind = ["dark"] + ["flat"] * 3
+    fit = hsnoise.fit(hsnoise.FrameStack([darks, *flats], [0.01] * 4, kind=kind, cfa="RGGB", shutter="global"))
+    assert fit.params["dark_signal_nonuniformity"].after_gain
+    value, error, _ = fit.table["dark_signal_nonuniformity.sigma"]
+    assert abs(value * gain.mean() - offset_dn) < 4 * error * gain.mean() < 0.1

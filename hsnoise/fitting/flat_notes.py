@@ -120,11 +120,14 @@ def _bent(found: FlatGain, c: int, of: str, bend: Bend) -> list[str]:
     top = found.full_scale_dn[c]
     off = float(variance_curve(found, c, top)) - 1
     gain = "The gain is given for low signal."
+    if found.bend[c, 1] and bend.is_curved:
+        gain += " The curve is not quite that of nonlinearity, x - curvature x^2."
     if bend.spreads:
         rest = "; the response bends, too (nonlinearity.curvature)" if bend.is_curved else ""
         return [
-            f"Variance over signal of the flats{of} changes by {off:+.1%} up to {top:.4g} DN, and neighbouring pixels"
-            f" share {bend.shared:.1%} of it: electrons spread as pixels fill (brighter_fatter){rest}. {gain}"
+            f"Variance over signal of the flats{of} changes by {off:+.1%} up to {top:.4g} DN, and a pixel shares"
+            f" {bend.shared:.1%} of its variance there with its neighbours: electrons spread as pixels fill"
+            f" (brighter_fatter){rest}. {gain}"
         ]
     held = " (nonlinearity.curvature)" if bend.is_curved else ""
     return [

@@ -43,6 +43,7 @@ from hsnoise.statistics.pixels.structure import (
     low_side_sigma,
     plane_rows,
 )
+from hsnoise.statistics.pixels.stuck import without_stuck
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer, pixel_transfer
@@ -68,6 +69,7 @@ class Channel:
             error, and its chance deviation if there is none.
         lines: by axis, static levels of rows and columns beside that drift.
         temporal_dn2: variance of the pixels themselves.
+        is_narrow: whether that noise is narrower than a count: rounding hides differences of pixels then.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_spectrum: of what rows share in a frame.
         noise_spread: of the logarithm of read noise over pixels, rows and columns.
@@ -94,6 +96,7 @@ class Channel:
     patterns: Mapping[str, tuple[float, float, float]]
     lines: Mapping[str, Lines]
     temporal_dn2: float
+    is_narrow: bool
     shading: Mapping[str, Shading]
     row_spectrum: RowSpectrum
     noise_spread: NoiseSpread
@@ -131,9 +134,10 @@ class PixelFit:
 
 def measure(found: Survey, summary: Summary) -> PixelFit:
     """Pixel transfer, flats and population of all channels, and the joint estimate."""
+    found = without_stuck(found)
     taps = taps_of(found)
     found = found if taps is None else levelled(found, taps)
-    flats = None if summary.flats is None else flat_gain(summary.flats)
+    flats = _flat_gain(found, summary)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
     channels = [_channel(found, c, name, register, told) for c, name in enumerate(found.channels)]
@@ -208,6 +212,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
         patterns=patterns_of(found, c, shading, lines),
         lines=lines,
         temporal_dn2=floor,
+        is_narrow=narrow is not None,
         shading=shading,
         row_spectrum=spectrum,
         noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if is_plain else UNKNOWN_SPREAD,
@@ -317,6 +322,17 @@ def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
     """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
     return next((p.narrow_dn for p in shortest_of(found, c)), None)
+
+
+def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:
+    """The gain of the flats; rounding does not tell the variance of darks that are narrower than a count."""
+    if summary.flats is None:
+        return None
+    narrow = [_narrow(found, c) for c in range(len(found.channels))]
+    if any(of is None for of in narrow):
+        return flat_gain(summary.flats)
+    variance, error = np.array([_of_narrow(of) for of in narrow if of is not None]).T
+    return flat_gain(summary.flats, read_variance_dn2=variance, read_variance_error_dn2=error)
 
 
 def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:

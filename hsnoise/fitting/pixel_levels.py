@@ -81,11 +81,8 @@ def is_unlit(found: Survey, growth: float) -> bool:
 
 
 def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None) -> float:
-    """The mean of the shortest exposure without stuck pixels, warm pixels' charge and jumps, DN."""
+    """The mean of the shortest exposure without warm pixels' charge and jumps, DN."""
     black = float(np.mean([p.row_mean_dn.mean() for p in found.shortest.of(c)]))
-    stuck, level = found.stuck(c), found.shortest.pixels(c, "level_dn").mean(0, dtype=np.float64)
-    if stuck.any() and not stuck.all():
-        black += level[~stuck].mean() - level.mean()
     if warm is not None:
         black -= warm.fraction[0] * warm.extra_dn[0]
     if jumps is not None and not jumps.double_sampling:

@@ -10,9 +10,10 @@ from hsnoise.likelihood.flat_gain import FlatGain, variance_curve
 from hsnoise.statistics.pixels.structure import plane_rows
 from hsnoise.statistics.pixels.survey import Group, Survey
 
-FEWEST_LEVELS = 4  # a line goes through two, and a third is not enough to tell a bend
+FEWEST_LEVELS = 3  # a line goes through two
 ABOVE_TOP = 1.01  # black levels that were reckoned apart
-SURE = 2.0  # standard errors
+SURE = 3.0  # standard errors from which neighbours share what is missing
+LIKELY, MOSTLY = 2.0, 0.4  # likewise, where they share so much of it that chance explains the rest
 LEAST_SHARED = 0.1  # of the variance that is missing
 NONE = (0.0, np.inf)
 
@@ -45,7 +46,7 @@ STRAIGHT = Bend()
 
 
 def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
-    """The bend of channel c, from flats of four levels or more.
+    """The bend of channel c, from flats of three levels or more.
 
     A response x - a x^2 has the variance gain^2 (1 - 2 a x)^2 x. Electrons that spread to neighbours take variance,
     too, but leave it in the covariance with them: what neighbours share is theirs, and the rest is the response's, or
@@ -66,11 +67,11 @@ def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
     shared, of_shared = _shared(found, c, top_dn)
     per_e = gain / top_dn
     together = float(np.hypot(error, of_shared)) if np.isfinite(of_shared) else error
+    rest = (1 + missing) / (1 - shared + 20 * (shared / 8) ** 2) - 1
+    if shared > max(LIKELY * of_shared, -MOSTLY * missing) and abs(rest) < LIKELY * together and missing < 0:
+        return Bend(NONE, _spread(missing, error, per_e), shared)
     if shared <= max(SURE * of_shared, -LEAST_SHARED * missing):
         return Bend(_curved(missing, together, per_e), NONE, shared)
-    rest = (1 + missing) / (1 - shared + 20 * (shared / 8) ** 2) - 1
-    if abs(rest) < SURE * together and missing < 0:
-        return Bend(NONE, _spread(missing, error, per_e), shared)
     return Bend(_curved(rest, together, per_e), (shared / 8 * per_e, of_shared / 8 * per_e), shared)
 
 

@@ -45,7 +45,7 @@ from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
-from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, shared_patterns
+from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, offsets_of, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -58,7 +58,6 @@ from hsnoise.statistics.pixels.transfer import ROUNDING
 NOMINAL = 50.0  # relative standard error of an unknown gain
 
 THERE = 5.0  # standard errors above which a population effect enters the model
-BENT = 2.0  # the same of what bends the curve of the variance, beside the test of the curve
 SUBTRACTED = 2.0  # the same of a dark signal that is subtracted, where pedestals or levels have moved beyond chance
 ROLLING_EXPONENT = 1.0  # of the paper; pixels over time do not determine it
 IN_ELECTRONS = (("gain", "value"), ("read_noise", "sigma"), ("dark_current", "rate"))
@@ -106,6 +105,8 @@ def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack
     gain, read, rate = _electrons(pixel)
     longest_s = float(np.max(summary.exposure_s, initial=0.0))
     shared = shared_patterns(pixel.channels, gain, summary.cfa)
+    if (offsets := offsets_of(pixel.channels, gain, summary.cfa)) is not None:
+        shared["dark_signal_nonuniformity"] = offsets
     population = _with_banks(_population(pixel, gain, shared, longest_s), pixel, model)
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
@@ -193,9 +194,6 @@ def _population(
         of_lines = [c.lines[axis].exponent for c in pixel.channels if axis in c.lines]
         if PATTERNS[axis] in found and all(value != 0 for value, _ in of_lines):
             found[PATTERNS[axis]]["exponent"] = of_colours(of_lines)
-    offset = of_colours([(c.offset_dn[0] / g, c.offset_dn[1] / g) for c, g in zip(pixel.channels, gain, strict=True)])
-    if offset[0] > THERE * offset[1]:
-        found["dark_signal_nonuniformity"] = {"sigma": offset}
     found |= {**_noise_spread(pixel), **rays_of(pixel, gain), **jumps_of(pixel, gain), **of_glow(pixel.channels, gain)}
     if (register := pixel.channels[0].register) is not None:
         found |= effects_of(register)
@@ -219,8 +217,8 @@ def _population(
 def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
     """What bends the photon transfer curve, if it does in all colours; that it does is known from the curve itself."""
     curvature, spread = (of_colours(list(of)) for of in zip(*(c.bend[:2] for c in pixel.channels), strict=True))
-    found = {"nonlinearity": {"curvature": curvature}} if abs(curvature[0]) > BENT * curvature[1] else {}
-    return found | ({"brighter_fatter": {"strength": spread}} if spread[0] > BENT * spread[1] else {})
+    found = {"nonlinearity": {"curvature": curvature}} if np.isfinite(curvature[1]) else {}
+    return found | ({"brighter_fatter": {"strength": spread}} if np.isfinite(spread[1]) else {})
 
 
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:

@@ -13,15 +13,19 @@ from hsnoise.statistics.pixels.glow import Glow
 from hsnoise.statistics.pixels.taps import GAINS_APART, Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
+OFFSETS_THERE = 5.0  # standard errors
 SURE = 10.0  # standard errors, at least, of offsets that were found by their seams
 AFTER = 12.0  # by which chi2 must be less for a pattern of one size in DN than for one of one size in electrons
 
 
 class Channel(Protocol):
-    """What a colour shares: by effect, variance, standard error and chance deviation, DN^2; noise of its pixels."""
+    """What a colour shares: by effect, variance, standard error and chance deviation, DN^2; noise of its pixels, and
+    whether it is narrower than a count; standard deviation of the pixels' offsets, DN, and its error."""
 
     patterns: Mapping[str, tuple[float, float, float]]
     temporal_dn2: float
+    is_narrow: bool
+    offset_dn: tuple[float, float]
 
 
 class Glowing(Protocol):
@@ -53,6 +57,17 @@ def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> 
             of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
             found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
     return found
+
+
+def offsets_of(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> Shared | None:
+    """The offsets of pixels, None within chance. Rounding hides an unknown part of them where noise is narrow."""
+    sigma, error = np.array([c.offset_dn for c in channels]).T
+    after = bool(np.isfinite(error).all()) and is_after_gain(sigma**2, 2 * sigma * error, gain)
+    scale = np.full(len(gain), gain[cfa_tile(cfa)].mean()) if after else gain
+    mean, of_mean = float(np.mean(sigma / scale)), _error_of_mean(error / scale)
+    if mean <= OFFSETS_THERE * of_mean:
+        return None
+    return Shared((mean, mean if any(c.is_narrow for c in channels) else of_mean), after)
 
 
 def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]]:

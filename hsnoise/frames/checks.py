@@ -49,16 +49,16 @@ def check_values(frame: np.ndarray, *, white_level: float | None = None, name: s
             f"{name}: {share:.1%} of the counts lie just below {end} and the others near 0: "
             "counts below 0 wrapped around, as where a dark is subtracted from unsigned counts; give the raw frames"
         )
-    if low == high:
-        what = "all zero" if high == 0 else f"all {high:g}"
-        raise ValueError(f"{name}: counts are {what}; a frame without any noise cannot be raw sensor data")
     if white_level is not None and high >= white_level:
         saturated = np.mean(frame >= white_level)
         if saturated > 0.5:
             raise ValueError(
                 f"{name}: {saturated:.0%} of the pixels reach white_level {white_level:g} DN (saturated); "
-                "shorten the exposure or correct white_level"
+                "shorten the exposure, leave it out, or correct white_level"
             )
+    if low == high:
+        what, or_else = ("all zero", "") if high == 0 else (f"all {high:g}", "; if it is saturated, leave it out")
+        raise ValueError(f"{name}: counts are {what}; a frame without any noise cannot be raw sensor data{or_else}")
 
 
 def wrapped_share(frame: np.ndarray, highest: int, end: int) -> float:

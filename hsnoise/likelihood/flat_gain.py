@@ -26,7 +26,9 @@ from hsnoise.likelihood.flats import FlatMoments
 
 MOST_DEGREES = 2  # of the curve
 SIGNIFICANT = 0.002  # p-value below which the curve has one more degree
-ADEQUATE = 3.0  # chi2 per degree of freedom up to which a curve describes the levels
+UNSEEN_SIGMAS = 2.0  # likewise, from which it adds to the error of the gain
+ADEQUATE = 3.0  # chi2 per degree of freedom up to which a curve describes the levels,
+RARE = 1e-3  # or, of few degrees of freedom, the chance of more
 LEAST_RANGE = 0.5  # share of the signal range that levels must span after the highest are left out
 FEWEST_LEVELS = 4  # likewise
 LINE_RANGE = 0.7  # of saturation: EMVA 1288, release 4, section 6.6
@@ -39,8 +41,9 @@ class FlatGain(NamedTuple):
     """Gain of flats, DN/e-, and the curve of their variance. Arrays are [channel] unless stated.
 
     gain: at low signal if `described`, that is if a straight line or a curve describes the levels, else that of EMVA
-    1288's line. standard_error includes the scatter of levels beyond chance. bend, bend_error [channel, 2]: a1 and a2,
-    0 if not significant; full_scale_dn: the signal where x is 1. chi2, dof: of the curve, with chance errors.
+    1288's line. standard_error includes the scatter of levels beyond chance, and a bend that is not quite significant.
+    bend, bend_error [channel, 2]: a1 and a2, 0 if not significant; full_scale_dn: the signal where x is 1. chi2, dof:
+    of the curve, with chance errors.
     used [level, channel]: the levels that determine the gain. level_gain, level_error [level, channel]: variance over
     signal and its chance error, NaN without signal. signal_dn [level, channel].
     weight [level, channel]: degrees of freedom with which the levels' variances give this gain with this error.
@@ -87,7 +90,8 @@ class _Curve(NamedTuple):
 
     @property
     def described(self) -> bool:
-        return self.chi2 <= ADEQUATE * max(self.dof, 1)
+        by_chance = scipy.stats.chi2.isf(RARE, self.dof) if self.dof else 0.0
+        return self.chi2 <= max(ADEQUATE * max(self.dof, 1), by_chance)
 
 
 def flat_gain(flats, black_dn=None, read_variance_dn2=None, read_variance_error_dn2=0.0) -> FlatGain:
@@ -128,6 +132,7 @@ def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
     n, curve = _longest(levels, full_scale)
     if curve.described:
         gain, standard_error = curve.coefficients[0], np.sqrt(curve.covariance[0, 0]) * curve.scale
+        standard_error = np.hypot(standard_error, _unseen_bend(_Levels(*(x[:n] for x in levels)), full_scale, curve))
         share = (levels.signal[:n] / levels.error[:n]) ** 2
     else:
         n = max(int((levels.signal <= LINE_RANGE * full_scale).sum()), min(len(order), 2))
@@ -218,6 +223,17 @@ def _curve(levels: _Levels, full_scale: float) -> _Curve:
         if scipy.stats.chi2.sf(gained, best.dof - curve.dof) < SIGNIFICANT:
             best = curve
     return best
+
+
+def _unseen_bend(levels: _Levels, full_scale: float, curve: _Curve) -> float:
+    """By how much one more degree would change the gain beyond chance: a bend may be there, but not be significant."""
+    degree = len(curve.coefficients)
+    if degree > min(MOST_DEGREES, (len(levels.signal) - 1) // 2):
+        return 0.0
+    other = _least_squares(levels, full_scale, degree)
+    change = other.coefficients[0] - curve.coefficients[0]
+    chance = (other.covariance[0, 0] - curve.covariance[0, 0]) * curve.scale**2
+    return float(np.sqrt(change**2 - chance)) if change**2 > UNSEEN_SIGMAS**2 * chance else 0.0
 
 
 def _least_squares(levels: _Levels, full_scale: float, degree: int) -> _Curve:
