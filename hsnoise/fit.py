@@ -14,7 +14,7 @@ from hsnoise.fitting.doubts.checks import Evidence, carries_no_gain, checked, co
 from hsnoise.fitting.line import line_fit
 from hsnoise.fitting.maximise import maximise
 from hsnoise.fitting.notes import closing_notes, outlier_fraction
-from hsnoise.fitting.pixel_flats import responses_differ
+from hsnoise.fitting.pixel_flats import flats_need_pixels
 from hsnoise.fitting.pixel_register import has_register
 from hsnoise.fitting.pixel_result import followed, result_of
 from hsnoise.fitting.problem import check_named
@@ -235,7 +235,7 @@ def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
     """Whether the fit is conditional on the pixel."""
     if (always := method == "transfer" or pixels == "differ") or method == "line" or pixels == "alike":
         return always
-    needed = pixels_differ(found) or rows_dominate(found) or responses_differ(found)
+    needed = pixels_differ(found) or rows_dominate(found) or flats_need_pixels(found)
     return (needed and can_be_transferred(found)) or has_register(found)
 
 

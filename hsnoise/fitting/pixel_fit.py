@@ -325,14 +325,19 @@ def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
 
 
 def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:
-    """The gain of the flats; rounding does not tell the variance of darks that are narrower than a count."""
-    if summary.flats is None:
+    """The gain of the flats. Rounding changes the variance of darks that are narrower than a count.
+
+    That of their noise counts then, if a curve describes the levels with it: EMVA 1288's line is that of measured ones.
+    """
+    if (flats := summary.flats) is None:
         return None
     narrow = [_narrow(found, c) for c in range(len(found.channels))]
-    if any(of is None for of in narrow):
-        return flat_gain(summary.flats)
-    variance, error = np.array([_of_narrow(of) for of in narrow if of is not None]).T
-    return flat_gain(summary.flats, read_variance_dn2=variance, read_variance_error_dn2=error)
+    if not any(of is None for of in narrow):
+        variance, error = np.array([_of_narrow(of) for of in narrow if of is not None]).T
+        by_noise = flat_gain(flats, None, variance, error)
+        if by_noise.described.all():
+            return by_noise
+    return flat_gain(flats)
 
 
 def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:

@@ -68,7 +68,14 @@ def _evened(flats: FlatGain, c: int, bend: Bend, signal_dn: float) -> tuple[floa
     return float(np.sqrt(variance)), 2 * share * (1 - 4 * share) / variance
 
 
-def responses_differ(found: Survey) -> bool:
+def flats_need_pixels(found: Survey) -> bool:
+    """Whether flats show what pooled pixels hide: responses that differ, or against darks narrower than a count, whose
+    variance rounding changes."""
+    narrow = found.shortest is not None and any(plane.narrow_dn is not None for plane in found.shortest.planes)
+    return bool(found.repeated_flats) and (narrow or _responses_differ(found))
+
+
+def _responses_differ(found: Survey) -> bool:
     """Whether pixels of some colour differ in what they add to a level of light, by more than chance."""
     rows = len(found.sampled_rows) * plane_rows(found)
     for group in found.repeated_flats:
