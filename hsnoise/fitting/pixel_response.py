@@ -12,6 +12,7 @@ from hsnoise.statistics.pixels.survey import Group, Survey
 
 FEWEST_LEVELS = 3  # a line goes through two
 ABOVE_TOP = 1.01  # black levels that were reckoned apart
+LEAST_RANGE = 0.2  # of the brightest level, that levels must span
 SURE = 3.0  # standard errors from which neighbours share what is missing
 LIKELY, MOSTLY = 2.0, 0.4  # likewise, where they share so much of it that chance explains the rest
 LEAST_SHARED = 0.1  # of the variance that is missing
@@ -78,7 +79,7 @@ def bend_of(found: Survey, flats: FlatGain, c: int) -> Bend:
 def _curved(missing: float, error: float, per_e: float) -> tuple[float, float]:
     """Curvature: (1 - 2 u)^2 / (1 - u) = 1 + missing, with u of the response missing at the brightest level."""
     u = (3 - missing - np.sqrt((3 - missing) ** 2 + 16 * missing)) / 8
-    return float(u * (1 - u) * per_e), float(abs(u / missing) * error * per_e)
+    return float(u * (1 - u) * per_e), float(abs(u / missing if missing else 1 / 3) * error * per_e)
 
 
 def _spread(missing: float, error: float, per_e: float) -> tuple[float, float]:
@@ -90,14 +91,14 @@ def _spread(missing: float, error: float, per_e: float) -> tuple[float, float]:
 def _shared(found: Survey, c: int, top_dn: float) -> tuple[float, float]:
     """By how much more of its variance a pixel shares with its neighbours at a signal of `top_dn` than at none.
 
-    Its error is infinite with fewer than three levels.
+    Its error is infinite with fewer than three levels, and if they are of the same light.
     """
     if not found.repeated_darks:
         return 0.0, np.inf
     black = _mean_dn(found.repeated_darks[0], c)
     signals = [_mean_dn(group, c) - black for group in found.repeated_flats]
     lit = [i for i, signal in enumerate(signals) if 0 < signal < ABOVE_TOP * top_dn]
-    if len(lit) < 3:
+    if len(lit) < FEWEST_LEVELS or np.ptp(np.array(signals)[lit]) < LEAST_RANGE * top_dn:
         return 0.0, np.inf
     share, error = np.array([_with_neighbours(found.repeated_flats[i], c, found) for i in lit]).T
     slope, covariance = np.polyfit(np.array(signals)[lit] / top_dn, share, 1, w=1 / error, cov="unscaled")
@@ -124,6 +125,6 @@ def _with_neighbours(group: Group, c: int, found: Survey) -> tuple[float, float]
         noise -= noise.mean()
         across = (noise[:, 1:] * noise[:, :-1]).mean()
         down = (noise[1:] * noise[:-1]).mean() if adjacent and rows > 1 else across
-        several.append(2 * (across + down) / noise.var())
+        several.append(2 * (across + down) / max(noise.var(), 1e-12))
     pixels = sum(plane.halves.level_dn.shape[1] for plane in group.of(c))
     return float(np.mean(several)), float((2 if adjacent else 4) * np.sqrt((2 if adjacent else 1) / pixels))
