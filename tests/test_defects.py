@@ -8,6 +8,8 @@ import pytest
 import hsnoise
 from hsnoise import FrameStack
 from hsnoise.simulation.defects import MOST, without_defects
+from hsnoise.statistics.pixels.flags import FLAGS, flags_of
+from hsnoise.statistics.pixels.survey import survey
 
 GAIN, READ_E, BLACK_DN, WHITE_DN, SHAPE = 0.5, 5.0, 64.0, 4095, (96, 128)
 PRNU, DSNU_DN = 0.01, 2.0
@@ -95,5 +97,8 @@ def test_defects_and_saturated_levels_change_neither_the_fit_nor_the_verdict(rng
     ):
         value, error = fit.table[name][:2]
         assert 1e-6 < error < max(0.03 * truth, 0.002) and abs(value - truth) < 4 * error, (name, value, error)
+    flags = flags_of(survey(stack), 0)
+    assert all((flags & FLAGS[name]).any() for name in ("stuck", "dead"))
+    assert not ((flags & FLAGS["stuck"] > 0) & (flags & FLAGS["dead"] > 0)).any()  # one count in light and dark
     found = hsnoise.compare(fit, stack)
     assert found.error < 4 and any("stuck or dead" in sentence for sentence in found.skipped)

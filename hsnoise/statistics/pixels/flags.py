@@ -25,7 +25,7 @@ def flags_of(found: Survey, channel: int) -> np.ndarray:
     stuck = found.stuck(channel)
     flags[stuck] |= FLAGS["stuck"]
     if found.repeated_flats:
-        flags[is_dead(found, channel)] |= FLAGS["dead"]
+        flags[is_dead(found, channel) & ~stuck] |= FLAGS["dead"]
     flags[is_hot(found, channel)] |= FLAGS["hot"]
     flags[_jumping(found.repeated_darks, channel, len(flags)) & ~stuck] |= FLAGS["telegraph"]
     return flags
