@@ -331,9 +331,9 @@ def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:
     """
     if (flats := summary.flats) is None:
         return None
-    narrow = [_narrow(found, c) for c in range(len(found.channels))]
-    if not any(of is None for of in narrow):
-        variance, error = np.array([_of_narrow(of) for of in narrow if of is not None]).T
+    narrow = [of for c in range(len(found.channels)) if (of := _narrow(found, c)) is not None]
+    if len(narrow) == len(found.channels):
+        variance, error = np.array([_of_narrow(of) for of in narrow]).T
         by_noise = flat_gain(flats, None, variance, error)
         if by_noise.described.all():
             return by_noise

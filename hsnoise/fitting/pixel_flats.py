@@ -38,7 +38,7 @@ def photo_response(
     if flats is None:
         return 0.0, np.inf
     brightest = np.where(flats.used[:, c], flats.signal_dn[:, c], 0.0).max()
-    signals = [float(np.mean([p.row_mean_dn.mean() for p in g.of(c)])) - black_dn for g in found.repeated_flats]
+    signals = [g.mean_dn(c) - black_dn for g in found.repeated_flats]
     levels = [
         Level(
             [p.halves.level_dn for p in g.of(c)],
@@ -82,10 +82,9 @@ def _responses_differ(found: Survey) -> bool:
         for c in range(len(found.channels)):
             if _saturates(group.pixels(c, "highest")):
                 continue
-            signal = np.mean([plane.row_mean_dn.mean() for plane in group.of(c)])
             blocks = [within_blocks(plane.halves.level_dn, rows, SIDES[0])[0] for plane in group.of(c)]
             variance, error = shared_variance(np.concatenate(blocks, axis=1).reshape(2, -1))
-            if variance > max(SURELY * error * SIDES[0], (LEAST_RESPONSE * signal) ** 2):
+            if variance > max(SURELY * error * SIDES[0], (LEAST_RESPONSE * group.mean_dn(c)) ** 2):
                 return True
     return False
 

@@ -82,7 +82,7 @@ def is_unlit(found: Survey, growth: float) -> bool:
 
 def mean_black(found: Survey, c: int, warm: Warm | None, jumps: Jumps | None) -> float:
     """The mean of the shortest exposure without warm pixels' charge and jumps, DN."""
-    black = float(np.mean([p.row_mean_dn.mean() for p in found.shortest.of(c)]))
+    black = found.shortest.mean_dn(c)
     if warm is not None:
         black -= warm.fraction[0] * warm.extra_dn[0]
     if jumps is not None and not jumps.double_sampling:

@@ -92,7 +92,7 @@ def multiplied_of(found: Survey, flats: FlatGain | None = None) -> Multiplied | 
         return None  # hits come with exposure alone, a register's electrons with its clocks, too
     shortest = found.shortest
     in_darks = clocks[0] + rate[0] * shortest.exposure_s
-    level = float(np.mean([p.row_mean_dn.mean() for p in shortest.of(0)]))
+    level = shortest.mean_dn(0)
     off = np.hypot(step[0] * np.hypot(clocks[1], rate[1] * shortest.exposure_s if rate[0] else 0.0), in_darks * step[1])
     return Multiplied(
         gain=(step[0], float(np.hypot(step[1], _of_multiplication(noise[0])))),

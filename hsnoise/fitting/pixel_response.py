@@ -95,18 +95,14 @@ def _shared(found: Survey, c: int, top_dn: float) -> tuple[float, float]:
     """
     if not found.repeated_darks:
         return 0.0, np.inf
-    black = _mean_dn(found.repeated_darks[0], c)
-    signals = [_mean_dn(group, c) - black for group in found.repeated_flats]
+    black = found.repeated_darks[0].mean_dn(c)
+    signals = [group.mean_dn(c) - black for group in found.repeated_flats]
     lit = [i for i, signal in enumerate(signals) if 0 < signal < ABOVE_TOP * top_dn]
     if len(lit) < FEWEST_LEVELS or np.ptp(np.array(signals)[lit]) < LEAST_RANGE * top_dn:
         return 0.0, np.inf
     share, error = np.array([_with_neighbours(found.repeated_flats[i], c, found) for i in lit]).T
     slope, covariance = np.polyfit(np.array(signals)[lit] / top_dn, share, 1, w=1 / error, cov="unscaled")
     return float(slope[0]), float(np.sqrt(covariance[0, 0]))
-
-
-def _mean_dn(group: Group, c: int) -> float:
-    return float(np.mean([plane.row_mean_dn.mean() for plane in group.of(c)]))
 
 
 def _with_neighbours(group: Group, c: int, found: Survey) -> tuple[float, float]:

@@ -97,6 +97,10 @@ class Group:
         """An attribute of `Halves` of all sampled pixels of a channel, [half, pixel] or [pixel]."""
         return np.concatenate([getattr(plane.halves, name) for plane in self.of(channel)], axis=-1)
 
+    def mean_dn(self, channel: int) -> float:
+        """Mean count of a channel, DN."""
+        return float(np.mean([plane.row_mean_dn.mean() for plane in self.of(channel)]))
+
     def level_error_dn(self, channel: int) -> float:
         """Standard error of a channel's level by how its frames differ, DN; 0 of one frame."""
         frames = np.mean([plane.frame_means_dn for plane in self.of(channel)], axis=0)
