@@ -18,20 +18,44 @@ class PhotoResponseNonuniformity(AbstractEffect):
     """Sensitivity of each pixel, max(1 + sigma z, 0) with z normal, the same in all frames of a sensor.
 
     Areas, micro-lenses and quantum efficiencies of pixels differ. It multiplies the expected photoelectrons, so their
-    shot noise follows.
+    shot noise follows. Whole rows and columns may differ likewise, by what they share when the masks of the sensor are
+    drawn, and even ones from odd ones, where neighbours are mirror images or share a readout; in a Bayer sensor even
+    from odd ones of a colour.
 
-    In dark frames: nothing; flats show a grain that stays when frames are averaged and grows in proportion to light.
+    In dark frames: nothing; flats show a grain that stays when frames are averaged and grows in proportion to light,
+    and stripes that do.
 
-    Reference: EMVA Standard 1288, release 4.0, 2021 (PRNU).
+    Reference: EMVA Standard 1288, release 4.0, 2021 (PRNU of pixels, rows and columns).
     """
 
     name: ClassVar[str] = "photo_response_nonuniformity"
     stage: ClassVar[Stage] = Stage.LIGHT
     sigma: Scalar = param("1", low=0, amplitude=True, doc="relative standard deviation over pixels")
+    row_sigma: Scalar = param(
+        "1", low=0, default=0.0, held="at bounds", doc="the same over whole rows; simulated fits hold 0"
+    )
+    column_sigma: Scalar = param(
+        "1", low=0, default=0.0, held="at bounds", doc="the same over whole columns; simulated fits hold 0"
+    )
+    row_parity: Scalar = param(
+        "1", low=-1, high=1, default=0.0, held=True, doc="odd rows less even ones, relative; simulated fits hold it"
+    )
+    column_parity: Scalar = param(
+        "1", low=-1, high=1, default=0.0, held=True, doc="odd columns less even ones, relative; simulated fits hold it"
+    )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        pattern = jax.random.normal(capture.fixed_key(self.name), (1, *signal.shape[1:]), signal.dtype)
-        return signal * jnp.maximum(1 + self.sigma * pattern, 0)
+        _, rows, columns = signal.shape
+        width = 1 if capture.cfa == "mono" else 2
+        pattern = 1 + self.sigma * jax.random.normal(capture.fixed_key(self.name), (1, rows, columns), signal.dtype)
+        for part, sigma, parity, lines, shape in (
+            (".rows", self.row_sigma, self.row_parity, capture.rows, (1, rows, 1)),
+            (".columns", self.column_sigma, self.column_parity, capture.columns, (1, 1, columns)),
+        ):
+            z = jax.random.normal(capture.fixed_key(self.name + part), shape, signal.dtype)
+            odd = jnp.asarray(lines // width % 2 - 0.5, signal.dtype).reshape(shape)
+            pattern = pattern + sigma * z + parity * odd
+        return signal * jnp.maximum(pattern, 0)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:

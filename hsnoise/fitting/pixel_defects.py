@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.fitting.pixel_fit import PixelFit
-from hsnoise.fitting.pixel_flats import weighted_mean
+from hsnoise.fitting.pixel_flats import of_colours, weighted_mean
 from hsnoise.statistics.pixels.population import Population
 
 FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
@@ -77,9 +77,3 @@ def _fano(pixel: PixelFit) -> tuple[float, float] | None:
         return None
     value, error = weighted_mean(told)
     return (float(np.clip(value, 0.5, 1.0)), error) if value < 1 - FANO_SIGMAS * error else None
-
-
-def of_colours(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values over the colours and its error; infinite errors are those of values of 0."""
-    values, errors = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
-    return float(values.mean()), float(np.sqrt((errors**2).sum()) / len(pairs))

@@ -15,10 +15,11 @@ from functools import partial
 import numpy as np
 
 from hsnoise.fitting.pixel_classes import classes_less
-from hsnoise.fitting.pixel_flats import photo_response
+from hsnoise.fitting.pixel_flats import Responses, photo_response
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
+from hsnoise.fitting.pixel_outputs import outputs_by_light
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
 from hsnoise.fitting.pixel_response import STRAIGHT, Bend, bend_of
@@ -74,7 +75,7 @@ class Channel:
         row_spectrum: of what rows share in a frame.
         noise_spread: of the logarithm of read noise over pixels, rows and columns.
         bend: of the response, from flats.
-        photo_response: relative standard deviation over pixels of the response to light (PRNU), with its error.
+        photo_response: how pixels, rows and columns differ in their response to light (PRNU).
         warm: the warm pixels, if the darks have one exposure; else None.
         rays: hits of single frames; None if there are none.
         banding: axis of the strongest sinusoid over rows or columns, and the sinusoid; None without one. Its variance
@@ -101,7 +102,7 @@ class Channel:
     row_spectrum: RowSpectrum
     noise_spread: NoiseSpread
     bend: Bend
-    photo_response: tuple[float, float]
+    photo_response: Responses
     warm: Warm | None
     rays: Rays | None
     jumps: Jumps | None
@@ -143,6 +144,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     channels = [_channel(found, c, name, register, told) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
+    taps, channels = outputs_by_light(found, taps, channels)
     estimate, covariance = joint_estimate(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)

@@ -10,9 +10,11 @@ import scipy  # its parts are imported when they are used
 from hsnoise.fitting.pixel_response import Bend
 from hsnoise.likelihood.flat_gain import FlatGain, relative_slope, variance_curve
 from hsnoise.statistics.pixels.flags import is_dead
+from hsnoise.statistics.pixels.line_response import LineResponse, LitPlane, line_response
 from hsnoise.statistics.pixels.population import root_of, shared_variance
+from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.structure import plane_rows, within_blocks
-from hsnoise.statistics.pixels.survey import Survey
+from hsnoise.statistics.pixels.survey import Group, Survey
 
 LEAST_SIGNAL_DN = 1.0  # of a flat: with less, rounding is all that differs
 LEAST_LIT = 0.2  # of the mean signal of a flat: corners that get less tell little
@@ -21,27 +23,52 @@ SIDES = 2, 8  # pixels of a block
 MORE_SIGMAS = 2.0  # by which large blocks may show more: it is light that varies within them
 SURELY = 5.0  # standard errors
 LEAST_RESPONSE = 5e-4  # relative: shot noise of a million electrons is larger
+LEAST_OF_LINES = 1e-4  # relative, of rows and columns
 MOST_SATURATED = 0.01  # share of a flat's pixels that reach its highest count
 CONTRADICTION = 1e-3  # chance of levels of light that scatter so much beyond their errors
+NONE = (0.0, np.inf)
+
+
+class Responses(NamedTuple):
+    """Relative differences of the response to light (PRNU), each with its error; infinite where nothing tells.
+
+    sigma, row_sigma, column_sigma: standard deviation over pixels, and over what whole rows and columns share.
+    row_parity, column_parity: odd rows (columns) less even ones.
+    """
+
+    sigma: tuple[float, float] = NONE
+    row_sigma: tuple[float, float] = NONE
+    column_sigma: tuple[float, float] = NONE
+    row_parity: tuple[float, float] = NONE
+    column_parity: tuple[float, float] = NONE
 
 
 def photo_response(
     found: Survey, c: int, black_dn: float, offset_dn: float, flats: FlatGain | None, bend: Bend
-) -> tuple[float, float]:
-    """Relative standard deviation of the pixels' response to light (PRNU), and its error, within blocks of pixels.
+) -> Responses:
+    """How pixels, rows and columns of a channel differ in their response to light.
 
     From flats of the range that determines the gain: charge that spills over evens out pixels that are nearly full. A
-    response that bends and electrons that spread even them out, too, which is taken off. Dust and vignetting hardly
-    vary within a block, whose own signal counts; if they vary within the large ones, the small ones count. Dead and
-    stuck pixels are left out. Without flats, the error is infinite. If the levels disagree, it holds their scatter.
+    response that bends and electrons that spread even them out, too, which is taken off.
     """
-    if flats is None:
-        return 0.0, np.inf
+    levels = [] if flats is None else _levels(found, c, black_dn, offset_dn, flats, bend)
+    if not levels:
+        return Responses()
+    sound = np.split(~(is_dead(found, c) | found.stuck(c)), len(levels[0].planes))
+    sigma = _of_pixels(levels, sound, black_dn, len(found.sampled_rows) * plane_rows(found))
+    rows, columns = (_of_lines(found, c, levels, sigma[0] ** 2, axis) for axis in (0, 1))
+    return Responses(sigma, root_of(*rows.variance), root_of(*columns.variance), rows.parity, columns.parity)
+
+
+def _levels(found: Survey, c: int, black_dn: float, offset_dn: float, flats: FlatGain, bend: Bend) -> list[Level]:
+    """The levels of light that tell how pixels respond."""
     brightest = np.where(flats.used[:, c], flats.signal_dn[:, c], 0.0).max()
     signals = [g.mean_dn(c) - black_dn for g in found.repeated_flats]
-    levels = [
+    return [
         Level(
+            g,
             [p.halves.level_dn for p in g.of(c)],
+            black_dn,
             signal,
             offset_dn / signal,
             *_evened(flats, c, bend, signal),
@@ -49,13 +76,51 @@ def photo_response(
         for g, signal in zip(found.repeated_flats, signals, strict=True)
         if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * brightest and not _saturates(g.pixels(c, "highest"))
     ]
-    if not levels:
-        return 0.0, np.inf
-    sound = np.split(~(is_dead(found, c) | found.stuck(c)), len(levels[0].planes))
-    rows = len(found.sampled_rows) * plane_rows(found)
+
+
+def _of_pixels(levels: list[Level], sound: list[np.ndarray], black_dn: float, rows: float) -> tuple[float, float]:
+    """Relative standard deviation over pixels of the response, within blocks of pixels, and its error.
+
+    Dust and vignetting hardly vary within a block, whose own signal counts; if they vary within the large ones, the
+    small ones count. Dead and stuck pixels are left out. If the levels disagree, the error holds their scatter.
+    """
     small, large = (_variance(levels, sound, black_dn, rows, side) for side in SIDES)
     apart = np.sqrt(max(small[1] ** 2 - large[1] ** 2, 0.0)) if np.isfinite(large[1]) else 0.0
     return root_of(*(large if large[0] - small[0] < MORE_SIGMAS * apart else small))
+
+
+def _of_lines(found: Survey, c: int, levels: list[Level], pixel_variance: float, axis: int) -> LineResponse:
+    """The response of rows (axis 0) or columns (1) of a channel, mean over its planes."""
+    step = 1 if found.cfa == "mono" else 2
+    places = found.sampled_rows[::step] if axis == 0 else np.arange(0, found.shape[1], step)
+    adjacent = axis == 1 or len(found.sampled_rows) == found.shape[0]
+    numbers = (places + found.origin[axis]) // step if adjacent else None
+    several = [
+        line_response([_lit(found, c, p, level) for level in levels], pixel_variance, axis=axis, numbers=numbers)
+        for p in range(len(levels[0].planes))
+    ]
+    return LineResponse(*(of_colours(list(of)) for of in zip(*several, strict=True)))
+
+
+def _lit(found: Survey, c: int, p: int, level: Level) -> LitPlane:
+    """A plane of a level of light above the darks, pixel by pixel."""
+    groups = [level.group] if found.shortest is None else [level.group, found.shortest]
+    maps = [group.of(c)[p].halves.level_dn.mean(0) for group in groups]
+    noise, lines = 0.0, np.zeros(2)
+    for group in groups:
+        plane = group.of(c)[p]
+        noise += without_outliers(plane.halves.pair_variance_dn2, group.n_frames)[0] / group.n_frames
+        of_lines = [plane.components[name].variance_dn2 for name in ("row_x_frame", "column_x_frame")]
+        lines += np.maximum(of_lines, 0.0) / group.n_frames
+    signal = maps[0] - maps[1] if found.shortest is not None else maps[0] - level.black_dn
+    shape = int(len(found.sampled_rows) * plane_rows(found)), -1
+    return LitPlane(signal.reshape(shape), noise, (float(lines[0]), float(lines[1])), level.evened)
+
+
+def of_colours(pairs: list[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of values over the colours, or planes, and its error; infinite errors are those of values of 0."""
+    values, errors = np.array(pairs, float).T
+    return float(values.mean()), float(np.sqrt((errors**2).sum()) / len(pairs))
 
 
 def _evened(flats: FlatGain, c: int, bend: Bend, signal_dn: float) -> tuple[float, float]:
@@ -90,10 +155,15 @@ def _responses_differ(found: Survey) -> bool:
 
 
 class Level(NamedTuple):
-    """A level of light: its planes [half, pixel], DN, its signal, DN, relative to it, the spread of offsets, and of
-    the differences of pixels the factor by which they are evened out and the correlation of neighbours."""
+    """A level of light: its group, planes [half, pixel], DN, black level and signal, DN.
 
+    of_offsets: the spread of offsets, relative to the signal. evened, alike: of the differences of pixels, the factor
+    by which they are evened out, and the correlation of neighbours.
+    """
+
+    group: Group
     planes: list[np.ndarray]
+    black_dn: float
     signal_dn: float
     of_offsets: float
     evened: float

@@ -38,9 +38,9 @@ from hsnoise.effects import (
     TapGains,
     TapOffsets,
 )
-from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_colours, rays_of, warm_of
+from hsnoise.fitting.pixel_defects import hot_of, jumps_of, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
-from hsnoise.fitting.pixel_flats import LEAST_RESPONSE
+from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, of_colours
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
@@ -200,9 +200,7 @@ def _population(
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
     found |= _bends(pixel)
-    response = of_colours([c.photo_response for c in pixel.channels])
-    if response[0] > max(THERE * response[1], LEAST_RESPONSE):
-        found["photo_response_nonuniformity"] = {"sigma": response}
+    found |= _responses(pixel)
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
         return found | warm_of(pixel, gain, longest_s)
@@ -212,6 +210,16 @@ def _population(
     if spread[0] > THERE * spread[1]:
         found["dark_current_nonuniformity"] = {"spread": spread}
     return found | hot_of(pixel, many)
+
+
+def _responses(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
+    """How pixels, rows and columns respond to light: means over the colours, of lines what is significant."""
+    by_name = zip(Responses._fields, zip(*(c.photo_response for c in pixel.channels), strict=True), strict=True)
+    found = {name: of_colours(list(of)) for name, of in by_name}
+    sigma = found.pop("sigma")
+    lines = {name: of for name, of in found.items() if abs(of[0]) > max(THERE * of[1], LEAST_OF_LINES)}
+    is_there = lines or sigma[0] > max(THERE * sigma[1], LEAST_RESPONSE)
+    return {"photo_response_nonuniformity": {"sigma": sigma, **lines}} if is_there else {}
 
 
 def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:

@@ -10,7 +10,7 @@ import numpy as np
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.statistics.pixels.glow import Glow
-from hsnoise.statistics.pixels.taps import GAINS_APART, Taps
+from hsnoise.statistics.pixels.taps import GAINS_APART, LEAST, Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
 OFFSETS_THERE = 5.0  # standard errors
@@ -95,7 +95,8 @@ def of_glow(channels: Sequence[Glowing], gain: np.ndarray) -> dict[str, dict[str
 def _of_two(taps: Taps, gain: float) -> dict[str, tuple[float, float]]:
     """Offset and gain of the second of two outputs less those of the first."""
     offset, mismatch, errors = np.diff(taps.offset_dn[0])[0], np.diff(taps.gain[0])[0], taps.gain_error[0]
-    found = {"offset": (float(offset) / gain, abs(float(offset)) / gain / SURE)}
+    least = np.sqrt(LEAST) * taps.noise_dn.mean()
+    found = {"offset": (float(offset) / gain, float(max(abs(offset) / SURE, least)) / gain)}
     if abs(mismatch) > GAINS_APART * np.hypot(*errors):  # False of NaN: no signal
         found["gain_mismatch"] = (float(mismatch), float(np.hypot(*errors)))
     return found

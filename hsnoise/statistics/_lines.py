@@ -18,6 +18,8 @@ HAAR_LEVELS = 6
 SAME_ROW = ((0, 1), (2, 3))
 SAME_COLUMN = ((0, 2), (1, 3))
 TINY = 1e-6
+BESIDE = 1.5  # variance of a line less the mean of the two beside it, in variances of a line
+MEDIAN_SQUARE = 0.4549  # of a standard normal variable
 WHITENED_FROM = 2  # the lowest frequencies of a periodogram carry trends, not lines
 
 
@@ -141,6 +143,26 @@ def scales(sheet: Sheet, x: Exposures) -> None:
         slow, fast = profile.sum(1) @ basis, moving.sum(1) @ basis
         value = log_ratio((slow**2).sum(1) * frames, (fast**2).sum((1, 2)) / (frames - 1))
         sheet.add(group, "low-order shape", value, np.sqrt(2 / 3 * frames / (frames - 1)))
+
+
+def responses(sheet: Sheet, x: Exposures) -> None:
+    """Static rows and columns less the mean of those on both sides, where light that varies smoothly cancels.
+
+    Of the typical line: edges of shadows are few.
+    """
+    _, frames, rows, columns = x.shape
+    if frames == 1:
+        return
+    for group, profile, places in (("row responses", x.row, columns), ("column responses", x.column, rows)):
+        beside = profile[..., 1:-1] - (profile[..., :-2] + profile[..., 2:]) / 2
+        lines = beside.shape[-1]
+        noise = BESIDE * x.variance / (frames * places)
+        typical = np.median(np.square(beside), -1) / MEDIAN_SQUARE
+        sheet.add(
+            group, "beside their neighbours", log_ratio(typical, noise), 2 * np.sqrt(2 / (beside.shape[1] * lines))
+        )
+        contrast = np.median(beside * (1.0 - 2.0 * (np.arange(lines) % 2)), -1)
+        sheet.add(group, "even and odd", np.abs(contrast) / np.sqrt(noise / lines), 0.75)
 
 
 def noise_of_rows(sheet: Sheet, x: Exposures) -> None:

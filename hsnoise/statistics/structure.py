@@ -48,6 +48,7 @@ STATISTICS = (
     _lines.colours,
     _lines.together,
     _lines.scales,
+    _lines.responses,
     _lines.noise_of_rows,
     _lines.spectra,
     _pixels.lags,
@@ -90,8 +91,11 @@ OF_FLATS = {
         "tails",
         "row x frame",
         "column x frame",
+        "row responses",
+        "column responses",
     )
 }
+LIT = "row responses", "column responses"  # of flats alone
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
@@ -109,7 +113,7 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
         ValueError: no dark exposure, or frames smaller than 32 x 32 pixels.
     """
     layout = layout_of(stack)
-    entries = _entries(stack, layout, black_level_dn)
+    entries = {key: of for key, of in _entries(stack, layout, black_level_dn).items() if key[0] not in LIT}
     if "flat" in stack.kind:
         lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
         entries |= {

@@ -122,8 +122,9 @@ class Group:
 class Survey:
     """The result of one pass over a stack: its groups, the rows [row] of the sampled pixels, and the shape.
 
-    is_whole: whether the frames are not known to be a part of a sensor's. code_step: the largest number of which all
-    counts are multiples, DN: 16 of 12 bits that are shifted into 16.
+    origin: numbers of the frames' first row and column on the sensor. is_whole: whether the frames are not known to be
+    a part of a sensor's. code_step: the largest number of which all counts are multiples, DN: 16 of 12 bits that are
+    shifted into 16.
     """
 
     groups: tuple[Group, ...]
@@ -131,6 +132,7 @@ class Survey:
     cfa: str
     sampled_rows: np.ndarray
     shape: tuple[int, int]
+    origin: tuple[int, int]
     full_scale_dn: float
     is_whole: bool
     code_step: int
@@ -197,7 +199,8 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
     full = float(stack.white_level) if stack.white_level is not None else _full_scale(highest)
     is_whole = stack.window is None or tuple(stack.window[2:]) == stack.shape
     step = int(np.gcd.reduce(steps))
-    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, full, is_whole, step)
+    origin = (0, 0) if stack.window is None else (stack.window[0], stack.window[1])
+    return Survey(tuple(groups), stack.channels, stack.cfa, rows, stack.shape, origin, full, is_whole, step)
 
 
 def _full_scale(highest: int) -> float:

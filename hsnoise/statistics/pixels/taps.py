@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -85,6 +85,16 @@ def taps_of(found: Survey) -> Taps | None:
     if offset.var() < LEAST * variance.mean() and noise_dn.std() < LEAST_NOISE * noise_dn.mean():
         return None
     return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds, at_rest), interleaved)
+
+
+def alternating(found: Survey) -> Taps | None:
+    """Even and odd columns as two outputs of the same level; None without darks of several frames."""
+    group = found.shortest
+    if group is None:
+        return None
+    bounds = [slice(None)], [slice(0, None, 2), slice(1, None, 2)]
+    at_rest = level, variance, _ = _moments(group, bounds)
+    return Taps(1, 2, np.zeros_like(level), np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds, at_rest), True)
 
 
 def _level_and_noise(group: Group) -> tuple[np.ndarray, np.ndarray]:
@@ -179,7 +189,7 @@ def _is_seam(profile: np.ndarray, edge: int, edges: Iterable[int]) -> bool:
     return bool(here[at == edge][0] > SEAM * typical and np.abs(at[near][here[near].argmax()] - edge) <= 1)
 
 
-def _gains(found: Survey, bounds: list[Bounds], at_rest: Moments) -> tuple[np.ndarray, np.ndarray]:
+def _gains(found: Survey, bounds: Sequence[Bounds], at_rest: Moments) -> tuple[np.ndarray, np.ndarray]:
     """Gains of blocks relative to their mean, by the variance that signal adds, and errors; weighted means.
 
     at_rest: moments of the blocks in the shortest darks.
@@ -203,7 +213,7 @@ def _gains(found: Survey, bounds: list[Bounds], at_rest: Moments) -> tuple[np.nd
     return (weight * ratios).sum(0) / weight.sum(0), weight.sum(0) ** -0.5
 
 
-def _moments(group: Group, bounds: list[Bounds]) -> Moments:
+def _moments(group: Group, bounds: Sequence[Bounds]) -> Moments:
     """Level of the typical pixel, mean variance without outliers, and its error, of each block."""
     variance = _map(group, "pair_variance_dn2")
     both = [
