@@ -36,6 +36,8 @@ FAMILIES = {
     "blocks": "pixel",
     "static columns": "column",
     "static rows": "row",
+    "column responses": "column",
+    "row responses": "row",
 }
 FAMILIES |= {of_flats: FAMILIES[group] for group, of_flats in OF_FLATS.items()}
 PLACE = {name: i for i, name in enumerate((*ORDER, OTHER))}

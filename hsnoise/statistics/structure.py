@@ -63,6 +63,7 @@ WORDS = {
     " exposures": "short and long exposures: means over the shorter and the longer half of the exposure times",
     " in band ": "bands: ranges of frequency over the rows or columns of a frame, from slow to fast",
     "row x frame": "row x frame, column x frame: means of rows or columns that are new in each frame",
+    "responses:": "row responses, column responses: static lines of flats less the mean of those on both sides",
     "static map": "static map: mean over the frames, what stays in place",
     " / ": "a / b: logarithm of the ratio of their mean squares, 0 if independent pixel noise makes both",
     "residual": "residual: a pixel of a frame minus its row, column and mean over frames, in spreads of its row",

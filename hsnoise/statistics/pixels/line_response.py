@@ -63,7 +63,7 @@ def line_response(
     noise = np.array([_noise(level, axis, places) for level in levels])
     several = np.array([profile[kept] / level.evened for profile, level in zip(profiles, levels, strict=True)])
     weight = 1 / noise / (1 / noise).sum()
-    mean = weight @ (several - several.mean(1, keepdims=True))
+    mean = weight @ (several - np.median(several, axis=1, keepdims=True))
     parity = NONE
     if numbers is not None:
         odd = np.where(numbers[1:-1][kept] % 2 == 1, 1.0, -1.0)
@@ -84,15 +84,16 @@ def _noise(level: LitPlane, axis: int, places: float) -> float:
 
 
 def _profile(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative excess of each line over those beside it [line], outliers cut, and its pixels in light [line].
+    """Logarithm of each line over those beside it [line], outliers cut, and its pixels in light [line].
 
     signal [line, place].
     """
     around = (signal[:-2] + signal[2:]) / 2
-    lit = around > LEAST_LIT * signal.mean()
+    least = max(LEAST_LIT * float(signal.mean()), TINY)
+    lit = around > least
     number = lit.sum(1)
     lit[:, 0] |= number == 0  # has a value, and does not count
-    excess = np.where(lit, signal[1:-1] / np.where(lit, around, 1.0) - 1, np.nan)
+    excess = np.where(lit, np.log(np.maximum(signal[1:-1], least / 2) / np.maximum(around, least)), np.nan)
     middle = np.nanmedian(excess, axis=1, keepdims=True)
     off = excess - middle
     width = CORE_SIGMAS * 1.4826 * float(np.nanmedian(np.abs(off)))
@@ -104,4 +105,5 @@ def _parity(contrast: np.ndarray) -> tuple[float, float]:
     middle = float(np.median(contrast))
     pieces = np.array([np.median(of) for of in np.array_split(contrast, PIECES)])
     error = 1.2533 * 1.4826 * float(np.median(np.abs(contrast - middle))) / np.sqrt(len(contrast))
+    middle = 2 * float(np.tanh(middle / 2))  # of logarithms
     return (middle, error) if (np.sign(pieces) == np.sign(middle)).all() else (0.0, max(abs(middle), error))
