@@ -159,7 +159,7 @@ def test_doubts_stand_above_the_table_and_notes_below_it(results):
     cells = pieces.of("td")
     rows = {cells[i]: cells[i + 1 : i + 4] for i in range(0, len(cells), 4)}
     assert rows["gain"] == ["2.00", "0.10", "DN/e-"] and rows["read_noise.sigma"] == ["not determined", "", "e-"]
-    assert rows["black_level"] == ["100", "held", "DN"] and list(rows) == list(fit.shown)
+    assert rows["black_level"] == ["100", "held", "DN"] and list(rows) == list(fit.told)
 
 
 def test_tables_show_what_is_printed(results):

@@ -111,3 +111,11 @@ def test_exponent_of_a_correlation_is_that_of_the_spectrum(exponent, lag):
 
 def test_exponent_of_what_no_power_law_reaches_is_at_a_bound():
     assert (exponent_of(-0.99, 64), exponent_of(1.0, 64)) == EXPONENTS
+
+
+def test_offsets_with_tails_are_not_warm_pixels(rng):
+    """They were `hot_pixels` with a rate, in green."""
+    offset = 100 + 2 * rng.standard_t(4, (192, 256))
+    frames = offset + 2 * rng.standard_normal((8, 192, 256))
+    fit = hsnoise.fit(hsnoise.FrameStack([np.rint(frames).astype(np.uint16)], [1.0], shutter="global"))
+    assert "hot_pixels" not in fit.params and "dark_signal_nonuniformity" in fit.params

@@ -12,7 +12,7 @@ from hsnoise.model import NoiseModel
 
 
 def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
-    """The parameters of a fit beside the true ones, if known; without parts of its effects that are not there."""
+    """The parameters of a fit beside the true ones, if known."""
     table = Table(box=SIMPLE_HEAD)
     table.add_column("parameter", no_wrap=True)
     for name in ("value", "standard error"):
@@ -22,10 +22,7 @@ def table_of(fit: FitResult, truth: NoiseModel | None = None) -> Table:
     if truth is not None:
         table.add_column("truth", justify="right", no_wrap=True)
         table.add_column("off by", justify="right", no_wrap=True)
-    not_there = {p.name for p in fit.params.parameters() if p.value == 0 and p.spec.holds(0.0)}
-    for name, (value, error, unit) in (fit.shown if truth is None else fit.in_order).items():
-        if error == 0 and name in not_there and name not in true_values:
-            continue
+    for name, (value, error, unit) in (fit.told if truth is None else fit.in_order).items():
         cells = [name, *rounded(value, error), unit_in_words(unit)]
         if name in true_values:
             true_value = true_values[name][0]

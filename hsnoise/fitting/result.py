@@ -224,6 +224,12 @@ class FitResult:
         return rows | {name: row for name, row in in_dn.items() if row[1] < MOST_ERROR_DN}
 
     @property
+    def told(self) -> dict[str, tuple[float, float, str]]:
+        """The rows of `shown` without the parts of effects that are held at 0: these are not there."""
+        not_there = {p.name for p in self.params.parameters() if p.value == 0 and p.spec.holds(0.0)}
+        return {name: row for name, row in self.shown.items() if row[1] != 0 or name not in not_there}
+
+    @property
     def outcome(self) -> str:
         """How the fit ended, in words."""
         return OUTCOMES[self.status].format(self.detail)
@@ -286,7 +292,7 @@ class FitResult:
         table = Table()
         for heading in ("parameter", "value", "standard error", "unit"):
             table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-        for name, (value, error, unit) in self.shown.items():
+        for name, (value, error, unit) in self.told.items():
             table.add_row(name, *rounded(value, error), unit_in_words(unit))
         return table
 

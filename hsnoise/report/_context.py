@@ -117,7 +117,7 @@ def parameters(fit: FitResult | NoiseModel) -> list[dict[str, str]]:
     if isinstance(fit, NoiseModel):
         found = [(name, f"{value:.5g}", unit_in_words(unit)) for name, (value, _, unit) in fit.table.items()]
         return [*(dict(zip(("name", "value", "unit"), row, strict=True)) for row in found), *chosen]
-    cells = [(name, *rounded(value, error), unit_in_words(unit)) for name, (value, error, unit) in fit.shown.items()]
+    cells = [(name, *rounded(value, error), unit_in_words(unit)) for name, (value, error, unit) in fit.told.items()]
     rows = [dict(zip(("name", "value", "error", "unit"), row, strict=True)) for row in cells]
     return [*rows, *({**row, "error": "held"} for row in chosen)]
 

@@ -30,6 +30,7 @@ LEAST_SPREAD = 0.02
 WINSOR_SIGMAS = 5.0
 MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and the logit that stands for none
 HOT_FROM = 2.0  # mean extra of hot pixels, over the mean of the others
+MOST_COLD = 0.5  # of the number of warm pixels
 WARM_SIGMAS = 6.0  # in units of the noise of the levels, from those below the median
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
@@ -134,7 +135,7 @@ def warm_of(halves: np.ndarray, columns: int) -> Warm | None:
     off = np.stack([half - of_neighbours(half, columns) for half in halves]).astype(np.float64)
     extra = off.mean(0) - np.median(off.mean(0))
     noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
-    if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise):
+    if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
         return None
     values, errors = _fitted(extra, noise)
     if values[2] <= 0:
@@ -146,6 +147,12 @@ def _hot_again(halves: np.ndarray, limit: float) -> bool:
     """Whether pixels that are hot in one half of the frames are hot in the other, unlike jumps and hits."""
     once = halves[0] > limit
     return bool(once.sum() > FEWEST_HOT and np.mean(halves[1][once] > limit / 2) > HOT_AGAIN)
+
+
+def _as_cold(halves: np.ndarray, limit: float) -> bool:
+    """Whether pixels lie as far below the others as above them: their offsets have tails then, and are not warm."""
+    below, above = ((sign * halves).min(0) > limit for sign in (-1, 1))
+    return bool(below.sum() > MOST_COLD * above.sum())
 
 
 def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
