@@ -241,3 +241,21 @@ def test_masters_alone_by_their_names_are_told(tmp_path):
     for i in range(2):
         write(tmp_path / f"masterdark{i}.fits", seed=i, EXPTIME=1.0)
     assert "2 frames called master: are they averages? These have less noise than frames" in load(tmp_path).assumed
+
+
+@pytest.mark.parametrize("shape", [(16, 20), (16, 12)])
+def test_flats_that_hold_one_count_show_the_white_level(night, shape):
+    """No header states it, and samples went on above it without a word."""
+    for i in range(2):
+        path = night / "flats" / f"bright{i}.fits"
+        fits.writeto(path, np.full(shape, 16383, np.uint16), fits.Header({"EXPTIME": 9.0}))
+        write(night / "flats" / f"lit{i}.fits", FLAT_DN, shape, EXPTIME=2.0)
+        (night / "flats" / f"{i}.fits").unlink()
+    stack = load(night)
+    assert stack.white_level == 16383
+    assert any("the white level is taken as 16383 DN" in sentence for sentence in stack.assumed)
+
+
+def test_dark_frames_among_flats_are_no_white_level(night):
+    fits.writeto(night / "flats" / "off.fits", np.zeros((16, 20), np.uint16), fits.Header({"EXPTIME": 9.0}))
+    assert load(night).white_level is None

@@ -54,18 +54,22 @@ def read_capture(
     found = sort_out(read, root)
     _check_exposures([*found.main, *found.elsewhere], source)
     gain, about_gain = _stated_gain([*found.main, *found.elsewhere])
-    stacks, about_levels = [], []
+    stacks, about_levels, parts, shown = [], [], [], None
     black_dn = _black_dn(found.main)
     for some, region in ((found.main, roi), (found.elsewhere, None)):
         if some:
             given = keywords["white_level"]
-            white_level = _shared(some, "white_level") if given is None else given
-            levels, about = split_levels(group_by_exposure(some), black_dn, white_level)
+            stated = _shared(some, "white_level") if given is None else given
+            levels, white_level, about = split_levels(group_by_exposure(some), black_dn, stated)
+            shown = white_level if stated is None and white_level is not None else shown
             about_levels += about
-            files = {one.path for one in read}
-            with _naming(root if len(files) > 1 else files.pop(), found.told):
-                stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
-            stacks.append(with_overscan(stack, overscan, some if region is None else ()))
+            parts.append((some, region, levels, stated))
+    files = {one.path for one in read}
+    for some, region, levels, stated in parts:
+        white_level = shown if stated is None else stated
+        with _naming(root if len(files) > 1 else next(iter(files)), found.told):
+            stack = _stack(levels, some, region, gain, **{**keywords, "white_level": white_level})
+        stacks.append(with_overscan(stack, overscan, some if region is None else ()))
     assumed = told + about_kinds + about_exposures + found.told + about_levels + about_gain
     joined = FrameStack.join(*stacks)
     return replaced(joined, assumed=(*assumed, *joined.assumed))

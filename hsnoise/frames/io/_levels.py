@@ -19,20 +19,24 @@ READERS = 2  # files decoded at the same time
 Groups = list[list[Recording]]
 
 
-def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> tuple[Groups, list[str]]:
-    """Groups of flats split by filter and light, darker first, and what was found; groups of darks are unchanged.
+def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> tuple[Groups, float | None, list[str]]:
+    """Groups of flats split by filter and light, darker first, the white level, and what was found.
 
-    The thinned means of each file's first frame are compared. Flats with most pixels at `white_level` are left out.
+    Groups of darks are unchanged. The thinned means of each file's first frame are compared. Flats with most pixels at
+    `white_level` are left out; if none is known, flats that hold one count alone show it.
     """
     out: Groups = []
     told: list[str] = []
     too_bright: list[Recording] = []
+    brightest, whites = black_dn, set()
     for group in groups:
         if group[0].kind == "dark":
             out.append(group)
             continue
         mean_dn, saturated = thinned(group, white_level)
         lit = [recording for recording, at_white in zip(group, saturated, strict=True) if not at_white]
+        brightest = max(brightest, mean_dn[~saturated].max(initial=-np.inf))
+        whites |= set(mean_dn[saturated].tolist())
         too_bright += [recording for recording, at_white in zip(group, saturated, strict=True) if at_white]
         levels = _levels_of(lit, mean_dn[~saturated] - black_dn)
         if len(levels) > 1:
@@ -44,7 +48,10 @@ def split_levels(groups: Groups, black_dn: float, white_level: float | None) -> 
         seconds = sorted(recording.exposure_s for recording in too_bright)
         name = f"{len(seconds)} flats of {' to '.join(f'{t:g}' for t in sorted({seconds[0], seconds[-1]}))} s"
         told.append(f"{name} were set aside: most of their pixels are saturated")
-    return out, told
+    if white_level is None and len(whites) == 1 and (only := whites.pop()) > brightest:
+        white_level = only
+        told.append(f"the white level is taken as {only:g} DN: these flats hold no other count")
+    return out, white_level, told
 
 
 def thinned(group: Sequence[Recording], white_level: float | None = None) -> tuple[np.ndarray, np.ndarray]:
