@@ -102,6 +102,43 @@ def test_outputs_are_told_from_responses_by_their_noise(rng, cfa):
     assert hsnoise.compare(fit, stack, draws=20).error < 3
 
 
+def test_both_are_told_apart_as_far_as_noise_goes(rng):
+    """All of it had been called gain, 130 of its errors off."""
+    fit = hsnoise.fit(capture(rng, outputs=0.04, column_parity=0.02))
+    for name, truth in (("odd_even_pattern.gain_mismatch", 0.04), ("photo_response_nonuniformity.column_parity", 0.02)):
+        value, error, _ = fit.table[name]
+        assert abs(value - truth) < 4 * error < truth
+
+
+def test_what_noise_does_not_tell_is_said(rng):
+    fit = hsnoise.fit(capture(rng, outputs=0.005))
+    assert responses(fit)["column_parity"][0] > 0 and "odd_even_pattern" not in fit.params
+    assert any("more frames of the flats" in note for note in fit.notes)
+
+
+def test_small_frames(rng):
+    """The median of two kinds of columns is one of them: 2 % between even and odd became a spread of 2 %."""
+    parity = np.where(np.arange(65) % 2 == 1, 0.01, -0.01)
+    signal = 1000 * (1 + parity) + rng.standard_normal((33, 65))
+    plane = LitPlane(signal, 1.0, (0.0, 0.0), 1.0)
+    found = line_response([plane], 0.0, axis=1, numbers=np.arange(65))
+    assert abs(found.parity[0] - 0.02) < 4 * found.parity[1] < 0.002
+    assert found.variance[0] < 4 * found.variance[1]
+    assert np.isfinite(line_response([plane], 0.0, axis=0, numbers=np.arange(33)).variance[1])
+
+
+def test_errors_of_parity(rng):
+    """They were a quarter too small: neighbouring differences share a line."""
+    pulls, odd = [], np.arange(256) % 2 - 0.5
+    for _ in range(300):
+        signal = 1000 * (1 + 0.01 * odd + 0.002 * rng.standard_normal(256)) + rng.standard_normal((64, 256))
+        value, error = line_response(
+            [LitPlane(signal, 1.0, (0.0, 0.0), 1.0)], 0.0, axis=1, numbers=np.arange(256)
+        ).parity
+        pulls.append((value - 0.01) / error)
+    assert 0.85 < np.std(pulls) < 1.15
+
+
 def test_dark_lines_and_defects_do_not_count(rng):
     """Overscan, dust in a part of the lines and dead pixels."""
     signal = 1000 * (1 + 0.003 * rng.standard_normal((200, 1))) + rng.standard_normal((200, 300))

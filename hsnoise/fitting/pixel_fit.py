@@ -19,6 +19,7 @@ from hsnoise.fitting.pixel_flats import Responses, photo_response
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
+from hsnoise.fitting.pixel_offsets import offset_of, pattern_of
 from hsnoise.fitting.pixel_outputs import outputs_by_light
 from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
@@ -34,16 +35,11 @@ from hsnoise.statistics.pixels.glow import Glow, glow_of, glow_of_pixels, withou
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
-from hsnoise.statistics.pixels.population import Population, Warm, offset_sigma, population_of, warm_of
+from hsnoise.statistics.pixels.population import Population, Warm, population_of, warm_of
 from hsnoise.statistics.pixels.read_noise import NoiseSpread, Tail, noise_spread_of, tail_of
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.shading import Shading
-from hsnoise.statistics.pixels.structure import (
-    beside_neighbours,
-    low_side_sigma,
-    plane_rows,
-)
 from hsnoise.statistics.pixels.stuck import without_stuck
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps, levelled, taps_of
@@ -119,6 +115,7 @@ class PixelFit:
     ringing: the part of the read noise that goes on along rows, if it is there.
     row_groups: rows that are read together, if there are.
     taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
+    parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -128,6 +125,7 @@ class PixelFit:
     row_groups: RowGroups | None
     taps: Taps | None
     code_step: int
+    parity_told: bool
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -144,7 +142,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     channels = [_channel(found, c, name, register, told) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
-    taps, channels = outputs_by_light(found, taps, channels)
+    taps, channels, parity_told = outputs_by_light(found, taps, channels)
     estimate, covariance = joint_estimate(channels)
     gain, variance = estimate[: len(channels)], np.diagonal(covariance)[: len(channels)]
     known = (gain > 0) & (variance > 0) & (variance < (DETERMINED * gain) ** 2)
@@ -154,7 +152,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    shared = ringing, found.row_groups, taps, found.code_step
+    shared = ringing, found.row_groups, taps, found.code_step, parity_told
     return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 
@@ -193,7 +191,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
     shading = shadings_of(found, c, spectrum.widened)
     lines = lines_in(found, c, shading)
-    offset = population.offset_sigma if population is not None else _offset(found, c)
+    offset = offset_of(found, c, population)
     warm = _warm(found, c) if is_plain and not found.has_exposures else None
     if pixels is not None:
         black = black_of_pixels(pixels), black[1]
@@ -301,26 +299,6 @@ def _warm(found: Survey, c: int) -> Warm | None:
     return warm_of(found.shortest.pixels(c, "level_dn"), len(shortest_of(found, c)[0].column_mean_dn))
 
 
-def _offset(found: Survey, c: int) -> tuple[float, float]:
-    """Standard deviation of offsets where exposures cannot separate them from dark current."""
-    if found.shortest is None:
-        return 0.0, np.inf
-    pattern, low_side = _pattern(found, c)
-    return offset_sigma(pattern, 0.0, low_side)
-
-
-def _pattern(found: Survey, c: int) -> tuple[np.ndarray, float]:
-    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN.
-
-    Without stuck pixels.
-    """
-    rows = len(found.sampled_rows) * plane_rows(found)
-    halves = [plane.halves for plane in shortest_of(found, c)]
-    low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
-    pattern = np.concatenate([beside_neighbours(of.level_dn, rows) for of in halves], axis=1)
-    return pattern[:, ~found.stuck(c)], low_side
-
-
 def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
     """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
     return next((p.narrow_dn for p in shortest_of(found, c)), None)
@@ -373,7 +351,7 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer, of_gl
         ordinary -= float(of_glow[slope_over(t, pixels.level).mean(0) < limit].mean())
         pixels = without_glow(pixels, of_glow)
         limit = hot_from(slope_over(t, pixels.level))
-    return population_of(pixels, limit, ordinary, shift, *_pattern(found, c))
+    return population_of(pixels, limit, ordinary, shift, *pattern_of(found, c))
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:

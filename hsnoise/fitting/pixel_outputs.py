@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from hsnoise.fitting.pixel_flats import Responses, of_colours
 from hsnoise.statistics.pixels.survey import Survey
-from hsnoise.statistics.pixels.taps import Taps, alternating
+from hsnoise.statistics.pixels.taps import GAINS_APART, Taps, alternating
 
 PARITY_THERE = 5.0  # standard errors
-RATHER = 9.0  # by which chi2 must be less for two gains than for two responses
+CONTRADICTS = 2.0  # standard errors
+SMALL = 2e-3  # differences in light of which it does not matter where they come from
+RATHER = 9.0  # by which chi2 must be less for two gains than for two responses, or the reverse
 
 
 class Lit(Protocol):
@@ -25,28 +27,46 @@ class Lit(Protocol):
 C = TypeVar("C", bound=Lit)
 
 
-def outputs_by_light(found: Survey, taps: Taps | None, channels: list[C]) -> tuple[Taps | None, list[C]]:
+class Outputs(NamedTuple):
+    """The outputs, the colours, and whether noise tells what makes even and odd columns differ in light."""
+
+    taps: Taps | None
+    channels: list[Any]
+    told: bool = True
+
+
+def outputs_by_light(found: Survey, taps: Taps | None, channels: list[C]) -> Outputs:
     """The outputs, and the colours without that part of their column parity that is the outputs'.
 
     A gain multiplies variance over signal as it does the signal, a response only the signal: the columns' own photon
-    transfer tells one from the other, and says response where it cannot.
+    transfer tells one from the other. Where it cannot, the difference is called a response, and is not told.
 
     Reference: Janesick, *Photon Transfer*, SPIE 2007 (gain of each amplifier from its own photon transfer).
     """
     parity, error = of_colours([one.photo_response.column_parity for one in channels])
     if not abs(parity) > PARITY_THERE * error or (taps is not None and not taps.interleaved):
-        return taps, channels
+        return Outputs(taps, channels)
     both = alternating(found) if taps is None else taps
     if both is None or np.isnan(both.gain).any():
-        return taps, channels
+        return Outputs(taps, channels, told=abs(parity) < SMALL)
     mismatch, of_it = float(np.diff(both.gain[0])[0]), float(np.hypot(*both.gain_error[0]))
-    if (mismatch / of_it) ** 2 - ((mismatch - parity) / of_it) ** 2 > RATHER:
-        gain = np.array([[1 - parity / 2, 1 + parity / 2]])
-        known = both._replace(gain=gain, gain_error=np.full_like(gain, error / np.sqrt(2)))
-        return known, _with_parity(channels, (0.0, error))
-    if taps is not None and taps.gains_differ:
-        return taps, _with_parity(channels, (parity - mismatch, float(np.hypot(error, of_it))))
-    return taps, channels
+    as_gain, as_response = ((mismatch - parity) / of_it) ** 2, (mismatch / of_it) ** 2
+    if max(as_gain, as_response) < RATHER:
+        return Outputs(taps, channels, told=abs(parity) < SMALL)
+    if as_response < as_gain and as_response < CONTRADICTS**2:
+        return Outputs(None if taps is None else _known(taps, 0.0, of_it), channels)
+    if as_gain < CONTRADICTS**2:
+        return Outputs(_known(both, parity, error), _with_parity(channels, (0.0, error)))
+    if abs(mismatch) < GAINS_APART * of_it:
+        return Outputs(taps, channels, told=abs(parity) < SMALL)
+    rest = parity - mismatch, float(np.hypot(error, of_it))
+    return Outputs(_known(both, mismatch, of_it), _with_parity(channels, rest))
+
+
+def _known(taps: Taps, mismatch: float, error: float) -> Taps:
+    """The outputs with that mismatch of their gains."""
+    gain = np.array([[1 - mismatch / 2, 1 + mismatch / 2]])
+    return taps._replace(gain=gain, gain_error=np.full_like(gain, error / np.sqrt(2)))
 
 
 def _with_parity(channels: Sequence[C], parity: tuple[float, float]) -> list[C]:

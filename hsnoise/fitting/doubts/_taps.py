@@ -36,6 +36,16 @@ def outputs(result: FitResult) -> Iterator[str]:
         )
 
 
+def columns_in_light(result: FitResult) -> Iterator[str]:
+    """That even and odd columns differ in light, where noise does not tell why."""
+    if result.transfer is not None and not result.transfer.parity_told:
+        yield (
+            "Whether even and odd columns differ in light by their response"
+            " (photo_response_nonuniformity.column_parity) or by the gains of two outputs"
+            " (odd_even_pattern.gain_mismatch), their noise does not tell: more frames of the flats would."
+        )
+
+
 def _taps(result: FitResult) -> Taps | None:
     return None if result.transfer is None else result.transfer.taps
 

@@ -20,7 +20,7 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
-from hsnoise.fitting.doubts._taps import gains_differ, outputs
+from hsnoise.fitting.doubts._taps import columns_in_light, gains_differ, outputs
 from hsnoise.fitting.flat_notes import flat_doubts, gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
@@ -88,6 +88,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
             *pixel_notes(result),
             *defects(result),
             *outputs(result),
+            *columns_in_light(result),
             *_of_codes(found),
             *_of_neighbours(result),
             *_of_narrow(result, found),

@@ -10,7 +10,7 @@ import numpy as np
 LEAST_LIT = 0.2  # of the mean signal: corners that get less tell little
 OUTLYING = 5.0  # deviations beyond which a line does not count more
 CORE_SIGMAS = 4.0  # pixels of a line further off are dust, defects or hot pixels
-FEWEST_LINES = 32
+FEWEST_LINES = 24
 LEAST_OF_LINE = 0.25  # of the pixels of the best lit line
 TINY = 1e-16
 PIECES = 8  # of the lines, in all of which odd ones lie on one side of even ones
@@ -63,7 +63,9 @@ def line_response(
     noise = np.array([_noise(level, axis, places) for level in levels])
     several = np.array([profile[kept] / level.evened for profile, level in zip(profiles, levels, strict=True)])
     weight = 1 / noise / (1 / noise).sum()
-    mean = weight @ (several - np.median(several, axis=1, keepdims=True))
+    # Even and odd lines apart: the median of both would be one or the other.
+    middle = (np.median(several[:, ::2], axis=1) + np.median(several[:, 1::2], axis=1)) / 2
+    mean = weight @ (several - middle[:, None])
     parity = NONE
     if numbers is not None:
         odd = np.where(numbers[1:-1][kept] % 2 == 1, 1.0, -1.0)
@@ -101,9 +103,14 @@ def _profile(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parity(contrast: np.ndarray) -> tuple[float, float]:
-    """Mean of what odd lines have more and even ones less [line], if it is so everywhere, and its standard error."""
+    """Mean of what odd lines have more and even ones less [line], if it is so everywhere, and its standard error.
+
+    Each line is in three of these values with the same sign: their mean is less certain than if they were independent.
+    """
     middle = float(np.median(contrast))
+    sigma = 1.4826 * float(np.median(np.abs(contrast - middle)))
+    middle = float(np.clip(contrast, middle - OUTLYING * sigma, middle + OUTLYING * sigma).mean())
     pieces = np.array([np.median(of) for of in np.array_split(contrast, PIECES)])
-    error = 1.2533 * 1.4826 * float(np.median(np.abs(contrast - middle))) / np.sqrt(len(contrast))
+    error = 2 * sigma / np.sqrt(BESIDE * len(contrast))
     middle = 2 * float(np.tanh(middle / 2))  # of logarithms
     return (middle, error) if (np.sign(pieces) == np.sign(middle)).all() else (0.0, max(abs(middle), error))

@@ -302,10 +302,16 @@ def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) 
 
 def shared_variance(pattern: np.ndarray) -> tuple[float, float]:
     """Variance over pixels that two halves of the frames [half, pixel] have in common, outliers cut, and its error."""
-    width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True)
-    a, b = np.clip(pattern, -width, width).astype(np.float64)
-    product = (a - a.mean()) * (b - b.mean())
+    a, b = map(winsorised, pattern)
+    product = a * b
     return float(product.mean()), float(product.std()) / np.sqrt(len(product))
+
+
+def winsorised(values: np.ndarray) -> np.ndarray:
+    """Values with a median near 0, outliers cut, less their mean."""
+    width = WINSOR_SIGMAS * 1.4826 * float(np.median(np.abs(values)))
+    cut = np.clip(values, -width, width).astype(np.float64)
+    return cut - cut.mean()
 
 
 def root_of(variance: float, error: float) -> tuple[float, float]:

@@ -1,0 +1,72 @@
+"""Offsets of pixels (DSNU): what the halves of the shortest exposure share, unless other exposures do not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hsnoise.fitting.pixel_patterns import shortest_of
+from hsnoise.statistics.pixels.population import Population, offset_sigma, root_of, winsorised
+from hsnoise.statistics.pixels.structure import beside_neighbours, low_side_sigma, plane_rows
+from hsnoise.statistics.pixels.survey import Group, Survey
+
+FEWEST_EXPOSURES, MOST_EXPOSURES = 4, 10
+NOT_SHARED = 3.0  # standard errors
+
+
+def offset_of(found: Survey, c: int, population: Population | None) -> tuple[float, float]:
+    """Standard deviation of the offsets of pixels, DN, and its error.
+
+    Interference and slow noise look alike in the frames of one exposure by chance, far beyond the chance of independent
+    pixels. Offsets are the same in all exposures: if these have less in common than the halves of the shortest
+    one, that is what counts, with the scatter that it shows.
+    """
+    if population is not None:
+        sigma, error = population.offset_sigma
+    elif found.shortest is None:
+        return 0.0, np.inf
+    else:
+        pattern, low_side = pattern_of(found, c)
+        sigma, error = offset_sigma(pattern, 0.0, low_side)
+    across = _across(found, c) if sigma > 0 else None
+    if across is not None and sigma**2 - across[0] > NOT_SHARED * np.hypot(across[1], 2 * sigma * error):
+        return root_of(*across)
+    return sigma, error
+
+
+def pattern_of(found: Survey, c: int) -> tuple[np.ndarray, float]:
+    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN.
+
+    Without stuck pixels.
+    """
+    rows = len(found.sampled_rows) * plane_rows(found)
+    halves = [plane.halves for plane in shortest_of(found, c)]
+    low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
+    return _beside(found, c, found.shortest), low_side
+
+
+def _beside(found: Survey, c: int, group: Group | None) -> np.ndarray:
+    """Pixels of a group beside their neighbours [half, pixel], DN, without stuck ones."""
+    rows = len(found.sampled_rows) * plane_rows(found)
+    planes = [] if group is None else group.of(c)
+    pattern = np.concatenate([beside_neighbours(of.halves.level_dn, rows) for of in planes], axis=1)
+    return pattern[:, ~found.stuck(c)]
+
+
+def _across(found: Survey, c: int) -> tuple[float, float] | None:
+    """Covariance over pixels of the shorter exposures with one another, DN^2, and its error, by the jackknife.
+
+    Dark current that differs between pixels adds to it, never takes from it. None with too few exposures.
+    """
+    darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)[:MOST_EXPOSURES]
+    if len(darks) < FEWEST_EXPOSURES:
+        return None
+    maps = np.array([winsorised(_beside(found, c, g).mean(0)) for g in darks])
+    mean = _covariance(maps)
+    without = np.array([_covariance(np.delete(maps, i, axis=0)) for i in range(len(maps))])
+    return mean, float(np.sqrt((1 - 1 / len(maps)) * ((without - without.mean()) ** 2).sum()))
+
+
+def _covariance(maps: np.ndarray) -> float:
+    """Mean over all pairs of maps [exposure, pixel] of the mean of their product."""
+    n = len(maps)
+    return float(np.mean(maps.sum(0) ** 2) - (maps**2).mean(1).sum()) / (n * (n - 1))
