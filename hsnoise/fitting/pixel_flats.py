@@ -56,7 +56,8 @@ def photo_response(
         return Responses()
     sound = np.split(~(is_dead(found, c) | found.stuck(c)), len(levels[0].planes))
     sigma = _of_pixels(levels, sound, black_dn, len(found.sampled_rows) * plane_rows(found))
-    rows, columns = (_of_lines(found, c, levels, sigma[0] ** 2, axis) for axis in (0, 1))
+    planes = [[_lit(found, c, p, level) for level in levels] for p in range(len(sound))]
+    rows, columns = (_of_lines(found, planes, sigma[0] ** 2, axis) for axis in (0, 1))
     return Responses(sigma, root_of(*rows.variance), root_of(*columns.variance), rows.parity, columns.parity)
 
 
@@ -89,16 +90,13 @@ def _of_pixels(levels: list[Level], sound: list[np.ndarray], black_dn: float, ro
     return root_of(*(large if large[0] - small[0] < MORE_SIGMAS * apart else small))
 
 
-def _of_lines(found: Survey, c: int, levels: list[Level], pixel_variance: float, axis: int) -> LineResponse:
-    """The response of rows (axis 0) or columns (1) of a channel, mean over its planes."""
+def _of_lines(found: Survey, planes: list[list[LitPlane]], pixel_variance: float, axis: int) -> LineResponse:
+    """The response of rows (axis 0) or columns (1) of a channel, mean over its planes [plane][level]."""
     step = 1 if found.cfa == "mono" else 2
     places = found.sampled_rows[::step] if axis == 0 else np.arange(0, found.shape[1], step)
     adjacent = axis == 1 or len(found.sampled_rows) == found.shape[0]
     numbers = (places + found.origin[axis]) // step if adjacent else None
-    several = [
-        line_response([_lit(found, c, p, level) for level in levels], pixel_variance, axis=axis, numbers=numbers)
-        for p in range(len(levels[0].planes))
-    ]
+    several = [line_response(levels, pixel_variance, axis=axis, numbers=numbers) for levels in planes]
     return LineResponse(*(of_colours(list(of)) for of in zip(*several, strict=True)))
 
 

@@ -57,18 +57,18 @@ def line_response(
     profiles, lit = zip(*(_profile(np.moveaxis(level.signal, axis, 0)) for level in levels), strict=True)
     pixels = np.min(lit, axis=0)
     kept = pixels > LEAST_OF_LINE * pixels.max()
-    if kept.sum() < FEWEST_LINES:
+    if kept.sum() < FEWEST_LINES:  # of which some are even and some odd
         return LineResponse()
     places = float(pixels[kept].mean())
     noise = np.array([_noise(level, axis, places) for level in levels])
     several = np.array([profile[kept] / level.evened for profile, level in zip(profiles, levels, strict=True)])
     weight = 1 / noise / (1 / noise).sum()
     # Even and odd lines apart: the median of both would be one or the other.
-    middle = (np.median(several[:, ::2], axis=1) + np.median(several[:, 1::2], axis=1)) / 2
+    is_odd = (np.arange(len(kept)) if numbers is None else numbers[1:-1])[kept] % 2 == 1
+    middle = (np.median(several[:, is_odd], axis=1) + np.median(several[:, ~is_odd], axis=1)) / 2
     mean = weight @ (several - middle[:, None])
-    parity = NONE
+    parity, odd = NONE, np.where(is_odd, 1.0, -1.0)
     if numbers is not None:
-        odd = np.where(numbers[1:-1][kept] % 2 == 1, 1.0, -1.0)
         parity = _parity(mean * odd)
         if abs(parity[0]) > PARITY_THERE * parity[1]:
             mean = mean - parity[0] * odd
