@@ -56,7 +56,7 @@ def photo_response(
         return Responses()
     sound = np.split(~(is_dead(found, c) | found.stuck(c)), len(levels[0].planes))
     sigma = _of_pixels(levels, sound, black_dn, len(found.sampled_rows) * plane_rows(found))
-    planes = [[_lit(found, c, p, level) for level in levels] for p in range(len(sound))]
+    planes = [_lit(found, c, p, levels, black_dn) for p in range(len(sound))]
     rows, columns = (_of_lines(found, planes, sigma[0] ** 2, axis) for axis in (0, 1))
     return Responses(sigma, root_of(*rows.variance), root_of(*columns.variance), rows.parity, columns.parity)
 
@@ -69,7 +69,6 @@ def _levels(found: Survey, c: int, black_dn: float, offset_dn: float, flats: Fla
         Level(
             g,
             [p.halves.level_dn for p in g.of(c)],
-            black_dn,
             signal,
             offset_dn / signal,
             *_evened(flats, c, bend, signal),
@@ -100,19 +99,24 @@ def _of_lines(found: Survey, planes: list[list[LitPlane]], pixel_variance: float
     return LineResponse(*(of_colours(list(of)) for of in zip(*several, strict=True)))
 
 
-def _lit(found: Survey, c: int, p: int, level: Level) -> LitPlane:
-    """A plane of a level of light above the darks, pixel by pixel."""
-    groups = [level.group] if found.shortest is None else [level.group, found.shortest]
-    maps = [group.of(c)[p].halves.level_dn.mean(0) for group in groups]
-    noise, lines = 0.0, np.zeros(2)
-    for group in groups:
-        plane = group.of(c)[p]
-        noise += without_outliers(plane.halves.pair_variance_dn2, group.n_frames)[0] / group.n_frames
-        of_lines = [plane.components[name].variance_dn2 for name in ("row_x_frame", "column_x_frame")]
-        lines += np.maximum(of_lines, 0.0) / group.n_frames
-    signal = maps[0] - maps[1] if found.shortest is not None else maps[0] - level.black_dn
+def _lit(found: Survey, c: int, p: int, levels: list[Level], black_dn: float) -> list[LitPlane]:
+    """A plane of each level of light above the darks, pixel by pixel."""
     shape = int(len(found.sampled_rows) * plane_rows(found)), -1
-    return LitPlane(signal.reshape(shape), noise, (float(lines[0]), float(lines[1])), level.evened)
+    dark, of_dark = (black_dn, np.zeros(3)) if found.shortest is None else _mean_and_noise(found.shortest, c, p)
+    planes = []
+    for level in levels:
+        mean, noise = _mean_and_noise(level.group, c, p)
+        of_pixels, of_rows, of_columns = (noise + of_dark).tolist()
+        planes.append(LitPlane((mean - dark).reshape(shape), of_pixels, (of_rows, of_columns), level.evened))
+    return planes
+
+
+def _mean_and_noise(group: Group, c: int, p: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of a plane over its frames [pixel], DN, and the variance by chance of pixels, rows and columns in it."""
+    plane = group.of(c)[p]
+    of_pixels = without_outliers(plane.halves.pair_variance_dn2, group.n_frames)[0]
+    of_lines = (max(plane.components[name].variance_dn2, 0.0) for name in ("row_x_frame", "column_x_frame"))
+    return plane.halves.level_dn.mean(0), np.array([of_pixels, *of_lines]) / group.n_frames
 
 
 def of_colours(pairs: list[tuple[float, float]]) -> tuple[float, float]:
@@ -153,7 +157,7 @@ def _responses_differ(found: Survey) -> bool:
 
 
 class Level(NamedTuple):
-    """A level of light: its group, planes [half, pixel], DN, black level and signal, DN.
+    """A level of light: its group, planes [half, pixel], DN, and signal, DN.
 
     of_offsets: the spread of offsets, relative to the signal. evened, alike: of the differences of pixels, the factor
     by which they are evened out, and the correlation of neighbours.
@@ -161,7 +165,6 @@ class Level(NamedTuple):
 
     group: Group
     planes: list[np.ndarray]
-    black_dn: float
     signal_dn: float
     of_offsets: float
     evened: float

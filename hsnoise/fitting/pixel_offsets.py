@@ -7,7 +7,7 @@ import numpy as np
 from hsnoise.fitting.pixel_patterns import shortest_of
 from hsnoise.statistics.pixels.population import Population, offset_sigma, root_of, winsorised
 from hsnoise.statistics.pixels.structure import beside_neighbours, low_side_sigma, plane_rows
-from hsnoise.statistics.pixels.survey import Group, Survey
+from hsnoise.statistics.pixels.survey import Plane, Survey
 
 FEWEST_EXPOSURES, MOST_EXPOSURES = 4, 10
 NOT_SHARED = 3.0  # standard errors
@@ -38,18 +38,20 @@ def pattern_of(found: Survey, c: int) -> tuple[np.ndarray, float]:
 
     Without stuck pixels.
     """
-    rows = len(found.sampled_rows) * plane_rows(found)
-    halves = [plane.halves for plane in shortest_of(found, c)]
+    planes, rows = shortest_of(found, c), _rows(found)
+    halves = [plane.halves for plane in planes]
     low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
-    return _beside(found, c, found.shortest), low_side
+    return _beside(planes, rows)[:, ~found.stuck(c)], low_side
 
 
-def _beside(found: Survey, c: int, group: Group | None) -> np.ndarray:
-    """Pixels of a group beside their neighbours [half, pixel], DN, without stuck ones."""
-    rows = len(found.sampled_rows) * plane_rows(found)
-    planes = [] if group is None else group.of(c)
-    pattern = np.concatenate([beside_neighbours(of.halves.level_dn, rows) for of in planes], axis=1)
-    return pattern[:, ~found.stuck(c)]
+def _rows(found: Survey) -> float:
+    """Sampled rows of a plane."""
+    return len(found.sampled_rows) * plane_rows(found)
+
+
+def _beside(planes: list[Plane], rows: float) -> np.ndarray:
+    """Pixels of planes beside their neighbours [half, pixel], DN."""
+    return np.concatenate([beside_neighbours(of.halves.level_dn, rows) for of in planes], axis=1)
 
 
 def _across(found: Survey, c: int) -> tuple[float, float] | None:
@@ -60,7 +62,8 @@ def _across(found: Survey, c: int) -> tuple[float, float] | None:
     darks = sorted(found.repeated_darks, key=lambda g: g.exposure_s)[:MOST_EXPOSURES]
     if len(darks) < FEWEST_EXPOSURES:
         return None
-    maps = np.array([winsorised(_beside(found, c, g).mean(0)) for g in darks])
+    kept = ~found.stuck(c)
+    maps = np.array([winsorised(_beside(g.of(c), _rows(found))[:, kept].mean(0)) for g in darks])
     mean = _covariance(maps)
     without = np.array([_covariance(np.delete(maps, i, axis=0)) for i in range(len(maps))])
     return mean, float(np.sqrt((1 - 1 / len(maps)) * ((without - without.mean()) ** 2).sum()))

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from hsnoise.fitting.pixel_flats import Responses, of_colours
+from hsnoise.statistics.pixels.line_response import PARITY_THERE
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.taps import GAINS_APART, Taps, alternating
 
-PARITY_THERE = 5.0  # standard errors
 CONTRADICTS = 2.0  # standard errors
 SMALL = 2e-3  # differences in light of which it does not matter where they come from
 RATHER = 9.0  # by which chi2 must be less for two gains than for two responses, or the reverse
@@ -46,19 +46,20 @@ def outputs_by_light(found: Survey, taps: Taps | None, channels: list[C]) -> Out
     parity, error = of_colours([one.photo_response.column_parity for one in channels])
     if not abs(parity) > PARITY_THERE * error or (taps is not None and not taps.interleaved):
         return Outputs(taps, channels)
+    as_it_is = Outputs(taps, channels, told=abs(parity) < SMALL)
     both = alternating(found) if taps is None else taps
     if both is None or np.isnan(both.gain).any():
-        return Outputs(taps, channels, told=abs(parity) < SMALL)
+        return as_it_is
     mismatch, of_it = float(np.diff(both.gain[0])[0]), float(np.hypot(*both.gain_error[0]))
     as_gain, as_response = ((mismatch - parity) / of_it) ** 2, (mismatch / of_it) ** 2
     if max(as_gain, as_response) < RATHER:
-        return Outputs(taps, channels, told=abs(parity) < SMALL)
+        return as_it_is
     if as_response < as_gain and as_response < CONTRADICTS**2:
         return Outputs(None if taps is None else _known(taps, 0.0, of_it), channels)
     if as_gain < CONTRADICTS**2:
         return Outputs(_known(both, parity, error), _with_parity(channels, (0.0, error)))
     if abs(mismatch) < GAINS_APART * of_it:
-        return Outputs(taps, channels, told=abs(parity) < SMALL)
+        return as_it_is
     rest = parity - mismatch, float(np.hypot(error, of_it))
     return Outputs(_known(both, mismatch, of_it), _with_parity(channels, rest))
 
@@ -70,6 +71,6 @@ def _known(taps: Taps, mismatch: float, error: float) -> Taps:
 
 
 def _with_parity(channels: Sequence[C], parity: tuple[float, float]) -> list[C]:
-    """The colours with that column parity."""
+    """The colours with that column parity, such that their mean has its error."""
     wide = parity[0], parity[1] * np.sqrt(len(channels))
     return [replace(one, photo_response=one.photo_response._replace(column_parity=wide)) for one in channels]

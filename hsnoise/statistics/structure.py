@@ -7,7 +7,7 @@ camera. Mostly correlations separate effects: between colours, frames, exposures
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,14 +41,14 @@ class Structure:
 
 BATCH_PIXELS = 1 << 20  # of the maps of exposures whose statistics are taken together
 PIXELS_AT_WORK = 1 << 21  # of the frames read together
-STATISTICS = (
+Statistics = tuple[Callable[[Sheet, Exposures], None], ...]
+STATISTICS: Statistics = (
     _pixels.levels,
     _pixels.codes,
     _lines.variances,
     _lines.colours,
     _lines.together,
     _lines.scales,
-    _lines.responses,
     _lines.noise_of_rows,
     _lines.spectra,
     _pixels.lags,
@@ -96,7 +96,6 @@ OF_FLATS = {
         "column responses",
     )
 }
-LIT = "row responses", "column responses"  # of flats alone
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # what is not finite is 0: `_ordered`
@@ -114,9 +113,9 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
         ValueError: no dark exposure, or frames smaller than 32 x 32 pixels.
     """
     layout = layout_of(stack)
-    entries = {key: of for key, of in _entries(stack, layout, black_level_dn).items() if key[0] not in LIT}
+    entries = _entries(stack, layout, black_level_dn, STATISTICS)
     if "flat" in stack.kind:
-        lit = _entries(stack, layout_of(stack, "flat"), black_level_dn)
+        lit = _entries(stack, layout_of(stack, "flat"), black_level_dn, (*STATISTICS, _lines.responses))
         entries |= {
             (OF_FLATS[group], what): entry
             for (group, what), entry in lit.items()
@@ -125,15 +124,17 @@ def structure(stack: FrameStack, black_level_dn: np.ndarray) -> Structure:
     return _ordered(entries, layout)
 
 
-def _entries(stack: FrameStack, layout: Layout, black_level_dn: np.ndarray) -> dict[tuple[str, str], Entry]:
-    """Statistics of the exposures of a layout by (group, what)."""
+def _entries(
+    stack: FrameStack, layout: Layout, black_level_dn: np.ndarray, statistics: Statistics
+) -> dict[tuple[str, str], Entry]:
+    """Statistics of the exposures of a layout by (group, what); `statistics`: those that each has by itself."""
     n = len(layout.frames)
     halves = [int(i >= n // 2) if n > 1 else 0 for i in range(n)]
     names = ("short", "long") if n > 1 else ("even", "odd")
     sheets, found, outliers = [], {}, np.zeros(1, np.uint16)
     for numbers in _batches(layout):
         x = _read(stack, layout, numbers, black_level_dn)
-        sheets.append(_sheet(x, layout.letters, numbers))
+        sheets.append(_sheet(x, layout.letters, numbers, statistics))
         found |= dict(zip(numbers, _kept(x, [halves[i] for i in numbers]), strict=True))
         if x.shape[1] >= VARIANCE_FRAMES:
             outliers = outliers + x.outliers.sum(0, dtype=np.uint16)
@@ -189,11 +190,11 @@ def _read(stack: FrameStack, layout: Layout, numbers: list[int], black_level_dn:
     return joined(found)
 
 
-def _sheet(x: Exposures, letters: tuple[str, ...], numbers: list[int]) -> Sheet:
-    """All statistics that exposures have each by itself."""
+def _sheet(x: Exposures, letters: tuple[str, ...], numbers: list[int], statistics: Statistics) -> Sheet:
+    """Statistics that exposures have each by itself."""
     sheet = Sheet(letters, numbers)
-    for statistics in STATISTICS:
-        statistics(sheet, x)
+    for some in statistics:
+        some(sheet, x)
     return sheet
 
 

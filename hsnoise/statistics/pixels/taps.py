@@ -23,6 +23,7 @@ GAINS_APART = 5.0  # standard errors of the spread of gains
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
 
 Bounds = list[slice]
+EVEN_AND_ODD: Bounds = [slice(0, None, 2), slice(1, None, 2)]
 Moments = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -78,7 +79,7 @@ def taps_of(found: Survey) -> Taps | None:
         return None
     bounds = [_bounds(found, axis, count) for axis, count in enumerate((rows, columns))]
     if interleaved:
-        columns, bounds[1] = 2, [slice(0, None, 2), slice(1, None, 2)]
+        columns, bounds[1] = 2, EVEN_AND_ODD
     at_rest = level_dn, variance, _ = _moments(group, bounds)
     offset = level_dn - level_dn.mean()
     noise_dn = np.sqrt(np.maximum(variance, 0.0))
@@ -92,7 +93,7 @@ def alternating(found: Survey) -> Taps | None:
     group = found.shortest
     if group is None:
         return None
-    bounds = [slice(None)], [slice(0, None, 2), slice(1, None, 2)]
+    bounds = [slice(None)], EVEN_AND_ODD
     at_rest = level, variance, _ = _moments(group, bounds)
     return Taps(1, 2, np.zeros_like(level), np.sqrt(np.maximum(variance, 0.0)), *_gains(found, bounds, at_rest), True)
 
