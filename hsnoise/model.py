@@ -349,7 +349,8 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
     """The known range of mean electrons if no effect has changed the light, between `low` and `high`, before."""
     rate = params["dark_current"].rate if "dark_current" in params else 0.0
-    changed = any(effect.acts_at < Stage.PHOTONS or may_scale("dark_current_scale", effect) for effect in params)
+    scales = ("light_scale", "dark_current_scale")
+    changed = any(effect.acts_at < Stage.PHOTONS or any(may_scale(s, effect) for s in scales) for effect in params)
     if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
         return "any"
     dark = float(rate) * float(exposure_s)

@@ -28,7 +28,8 @@ def signals(key, light, shape, effects, capture):
     """
     scales = {what: _scale_of(what, key, effects, capture, shape) for what in SCALES}
     capture = dataclasses.replace(capture, **scales)
-    signal = light
+    of_light = _scale_of("light_scale", key, effects, capture, shape)
+    signal = light if of_light is None else jnp.broadcast_to(light, shape) * of_light
     for effect in effects:
         try:
             drawn = _sample_one(key, signal, shape, effect, capture)

@@ -19,6 +19,7 @@ from hsnoise._core.types import RandomKey
 from hsnoise.criticism import sentences, shares
 from hsnoise.criticism.compare import Comparison, compared
 from hsnoise.criticism.measured_curve import with_response
+from hsnoise.criticism.measured_light import with_photo_response
 from hsnoise.criticism.measured_maps import Sensor
 from hsnoise.criticism.measured_noise import (
     ALLOWED,
@@ -32,13 +33,15 @@ from hsnoise.criticism.measured_noise import (
     with_spectra,
 )
 from hsnoise.criticism.shares import Share
+from hsnoise.effects import Stage
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits, draw_capture
-from hsnoise.simulation.portion import Portion
+from hsnoise.simulation.portion import Portion, usable_flats
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.apart import FEWEST_FRAMES, Apart
+from hsnoise.statistics.structure import OF_FLATS
 
 NEEDED = ("gain", "read_noise")
 MOST_COUNTS = 1 << 26  # of an exposure in memory; of larger ones the first frames
@@ -98,8 +101,9 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         model: a fit, or a NoiseModel with a gain and read noise.
         stack: frames from which components are measured: a path or a list of paths, with the keywords of
             `hsnoise.load`; a FrameStack; or an array of counts with FrameStack's keywords. Darks of two frames or more
-            are used, and flats of five levels or more for the response.
-        held_out: other darks of the same sensor, to judge by; None: the frames themselves.
+            are used, flats of two frames or more for the response of each pixel, and flats of five levels or more for
+            the response of all.
+        held_out: other darks of the same sensor, to judge by, beside the flats; None: the frames themselves.
         seed: of all draws.
 
     Raises:
@@ -112,30 +116,50 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     missing = [name for name in NEEDED if name not in params]
     if missing:
         raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
-    darks = repeated_darks(stack)
-    judge = Portion.of(darks if held_out is None else repeated_darks(held_out))
+    darks, flats = repeated_darks(stack), _flats(stack)
+    judging = darks if held_out is None else repeated_darks(held_out)
+    judge = Portion.of(judging if flats is None else FrameStack.join(judging, flats))
     with jax.enable_x64(True):
-        found = with_response(_Closing.of(darks, seed).closed(params), stack)
+        models = _Closing.of(darks, seed).with_light(params, stack, flats)
+    found, comparison = _nearest(models, judge, seed)
     key = key_for(seed, Purpose.SHARES)
-    replaced = tuple(effect.name for effect in params if effect.measurable)
+    gone = [effect for effect in params if effect.name not in found]
+    replaced = tuple(effect.name for effect in gone if effect.measurable or effect.stage == Stage.LIGHT)
     return ClosedModel(
         params=found,
         named=params,
         replaced=replaced,
-        overshot=tuple(name for name in params.names if name not in (*replaced, *found.names)),
-        shares=shares.shares_of(params, judge.frames, key, closed=found),
-        static=_static(params, judge.frames, key, replaced),
-        comparison=compared(found, judge, seed=seed),
+        overshot=tuple(effect.name for effect in gone if effect.name not in replaced),
+        shares=shares.shares_of(params, judge.darks.frames, key, closed=found),
+        static=_static(params, judge.darks.frames, key, replaced),
+        comparison=comparison,
         before=compared(params, judge, seed=seed),
     )
+
+
+def _nearest(models: list[NoiseModel], judge: Portion, seed: int) -> tuple[NoiseModel, Comparison]:
+    """The model whose flats are nearest to those of `judge`, and its comparison."""
+    found = [(model, compared(model, judge, seed=seed)) for model in models]
+    return min(found, key=lambda one: sum(one[1].groups.get(group, 0.0) for group in OF_FLATS.values()))
 
 
 def repeated_darks(stack: FrameStack) -> FrameStack:
     """The dark exposures of two frames or more. Raises ValueError without any."""
     if not stack.repeated_darks:
         raise ValueError("stack: expected two frames or more of a dark exposure, to tell what stays from what changes")
+    return _in_memory(stack, stack.repeated_darks)
+
+
+def _flats(stack: FrameStack) -> FrameStack | None:
+    """The flats that can be compared, if any."""
+    usable = usable_flats(stack)
+    return _in_memory(stack, usable) if usable else None
+
+
+def _in_memory(stack: FrameStack, exposures: list[int]) -> FrameStack:
+    """Some exposures, of which all frames, or as many as may be held, are used."""
     most = max(FEWEST_FRAMES, MOST_COUNTS // (stack.shape[0] * stack.shape[1]))
-    return stack.select(exposures=stack.repeated_darks, frames=slice(0, most))
+    return stack.select(exposures=exposures, frames=slice(0, most))
 
 
 def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tuple[str, ...]) -> str:
@@ -175,6 +199,18 @@ class _Closing:
             if number == 0:
                 model = with_distribution(model, self.sensor)
         return model
+
+    def with_light(self, named: NoiseModel, stack: FrameStack, flats: FrameStack | None) -> list[NoiseModel]:
+        """The closed model with what flats tell; two where they show a bent response, which may be that of the lamp.
+
+        flats: those of `stack` that can be compared; without any, a bent response is taken for the sensor's.
+        """
+        model = self.closed(named)
+        bent = with_response(model, stack)
+        if flats is None:
+            return [bent]
+        models = [model] if bent is model else [model, bent]
+        return [with_photo_response(one, flats, self.sensor.rng) for one in models]
 
     def drawn(self, model: NoiseModel, number: int) -> tuple[Apart, ...]:
         """Frames drawn as the measured ones were taken, taken apart."""

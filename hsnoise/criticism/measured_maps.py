@@ -65,7 +65,7 @@ class Sensor:
         offset, growth = np.empty(shape), np.zeros(shape)
         for p in range(step * step):
             at = (slice(p // step, None, step), slice(p % step, None, step))
-            offset[at], growth[at] = self._levels(at)
+            offset[at], growth[at] = self.levels(at)
         if self.grows and "black_clamp" in model:  # stays in the model, and subtracts from what grows
             growth += np.asarray(model["black_clamp"].rate)[channel]
         charge = self._charge(growth, gain) if self.grows and "dark_current" in model else np.zeros(shape)
@@ -82,7 +82,7 @@ class Sensor:
         first = (0, 0) if self.window is None else self.window[:2]
         return model.add(MeasuredMap(**{name: x.astype(np.float32) for name, x in maps.items()}, first=first))
 
-    def _levels(self, at: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
+    def levels(self, at: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
         """Offset, DN, and growth, DN/s, of each pixel of a plane, drawn from the posterior."""
         n, t = np.array([one.n_frames for one in self.seen]), self.exposure_s
         noise = np.array([one.ordinary_variance(at) for one in self.seen]) / n

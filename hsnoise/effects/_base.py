@@ -228,6 +228,10 @@ class AbstractEffect(eqx.Module):
         """Factor on the dark current of each pixel, like `read_noise_scale` but of mean 1: the rate stays the mean."""
         return None
 
+    def light_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> Frames | PixelMap | None:
+        """Factor of mean 1 on the light that falls on each pixel, for effects that act at a later stage; None: 1."""
+        return None
+
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:
         """How strong it may be in a capture that may lack it, or None if this capture cannot show it.

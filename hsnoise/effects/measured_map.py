@@ -1,4 +1,4 @@
-"""What each pixel of one sensor does, measured: its offset, dark current and read noise."""
+"""What each pixel of one sensor does, measured: its offset, dark current, read noise and response to light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import MOST_LINES, is_whole, measured
 
 NORMALISED = 1e-3  # relative deviation of a mean or mean square from 1 that is rounding
-SCALES = {"dark_current": np.mean, "read_noise": lambda x: np.mean(x**2)}
+SCALES = {"dark_current": np.mean, "read_noise": lambda x: np.mean(x**2), "photo_response": np.mean}
 
 
 def _rms(values: np.ndarray) -> float:
@@ -35,11 +35,11 @@ def _pair(first: Any) -> Any:
 
 
 class MeasuredMap(AbstractEffect):
-    """Maps of one sensor: an offset, and factors on the dark current and the read noise of each pixel.
+    """Maps of one sensor: an offset, and factors on the dark current, the read noise and the light of each pixel.
 
     In place of a law over pixels, such as `dark_signal_nonuniformity`, these are the pixels themselves: every draw is
     the sensor that was measured, whatever its `sensor_key`. The offset is in DN, after the gain. The factors have a
-    mean (dark current) and a mean square (read noise) of 1, so the rate stays the mean and the sigma the rms.
+    mean (dark current, light) or a mean square (read noise) of 1, so the rate stays the mean and the sigma the rms.
 
     Frames that are a window of the sensor take their part of the maps. Beyond the maps, or in frames of another size
     without a window, the maps are continued by mirrored copies.
@@ -48,7 +48,7 @@ class MeasuredMap(AbstractEffect):
         first: row and column of the sensor at which the maps begin.
 
     Reference: Feng, Wang, Wang, Fan, Huang, "Learnability enhancement for low-light raw denoising", ACM MM 2022
-    (dark shading).
+    (dark shading); EMVA Standard 1288, release 4.0, 2021 (photo response).
     """
 
     name: ClassVar[str] = "measured_map"
@@ -69,6 +69,7 @@ class MeasuredMap(AbstractEffect):
         summary_unit="DN/s",
         doc="change of each pixel's offset with exposure that is no charge; in tables its rms",
     )
+    photo_response: jax.Array | None = _factor(np.std, "photoelectrons of each pixel over the mean, in even light")
     first: tuple[int, int] = eqx.field(static=True, default=(0, 0), converter=_pair)
 
     def check_arrays(self) -> None:
@@ -80,7 +81,7 @@ class MeasuredMap(AbstractEffect):
         for field, norm in SCALES.items():
             value = getattr(self, field)
             if value is not None and abs(norm(np.asarray(value, float)) - 1) > NORMALISED:
-                what = "mean" if field == "dark_current" else "mean square"
+                what = "mean square" if field == "read_noise" else "mean"
                 raise ValueError(f"measured_map.{field}: expected a {what} of 1, got {norm(np.asarray(value, float))}.")
 
     def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
@@ -92,11 +93,14 @@ class MeasuredMap(AbstractEffect):
         change = self._part(self.dark_fluctuation, capture) * jax.random.normal(key, shape, mean.dtype)
         return mean * jnp.maximum(1 + change, 0)
 
+    def light_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
+        return None if self.photo_response is None else self._part(self.photo_response, capture)
+
     def read_noise_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:
         return None if self.read_noise is None else self._part(self.read_noise, capture)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        """The signal with the offsets; the effects that draw dark current and read noise apply the other maps."""
+        """The signal with the offsets; the other maps scale the light, and what other effects draw."""
         self._tell_of_copies(capture)
         if self.growth is not None:
             signal = signal + capture.exposure_s * self._part(self.growth, capture)

@@ -92,15 +92,23 @@ def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
     """Expected photoelectrons [row, column] at which `model` gives an exposure of `like` its mean; 0 in darks."""
     if like.kind[exposure] == "dark":
         return np.broadcast_to(np.float32(0), like.shape)
-    channel = channel_index(like.cfa, like.shape)
-    dark_e = float(model["dark_current"].rate) * like.exposure_s[exposure] if "dark_current" in model else 0.0
-    level = _illumination_dn(like, exposure)
+    light_e = photoelectrons(model, _illumination_dn(like, exposure), float(like.exposure_s[exposure]))
+    return np.maximum(light_e, 0.0).astype(np.float32)
+
+
+def photoelectrons(model: NoiseModel, reading_dn: np.ndarray, exposure_s: float) -> np.ndarray:
+    """Photoelectrons [..., row, column] that read so many DN, in pixels without offsets and with the mean dark current.
+
+    Below 0 where the reading is below that of darks.
+    """
+    channel = channel_index(model.cfa, reading_dn.shape[-2:])
+    dark_e = float(model["dark_current"].rate) * exposure_s if "dark_current" in model else 0.0
     if "measured_response" in model:
-        level = model["measured_response"].before(level)
-    signal_e = (level - black_level_of(model)[channel]) / np.asarray(model["gain"].value)[channel]
+        reading_dn = model["measured_response"].before(reading_dn)
+    signal_e = (reading_dn - black_level_of(model)[channel]) / np.asarray(model["gain"].value)[channel]
     if "nonlinearity" in model:
         signal_e = model["nonlinearity"].before(signal_e)
-    return np.maximum(signal_e - dark_e, 0.0).astype(np.float32)
+    return signal_e - dark_e
 
 
 @lru_cache(maxsize=32)

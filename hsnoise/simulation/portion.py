@@ -62,7 +62,8 @@ class Portion:
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
         bright = [i for i in range(part.n_exposures) if _is_saturated(part, i)]
-        full = [i for i in _beyond_the_range(part) if i not in bright]
+        lit = [i for i, kind in enumerate(part.kind) if kind == "flat"]
+        full = [i for i in _beyond_the_range(part, lit) if i not in bright]
         if bright or full:
             kept_exposures = [i for i in range(part.n_exposures) if i not in (*bright, *full)]
             part, chosen = part.select(exposures=kept_exposures), [chosen[i] for i in kept_exposures]
@@ -101,6 +102,13 @@ class Portion:
         return darks if darks is self else replace(darks, left_out=(*self.left_out, f"flats were not compared: {why}"))
 
 
+def usable_flats(stack: FrameStack) -> list[int]:
+    """Flats of two frames or more that are neither saturated nor beyond the linear range; there must be darks."""
+    repeated = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
+    full = _beyond_the_range(stack, repeated)
+    return [i for i in repeated if i not in full and not _is_saturated(stack, i)]
+
+
 def _is_saturated(stack: FrameStack, exposure: int) -> bool:
     """Whether so many pixels of a flat are at the white level that it shows little else."""
     if stack.kind[exposure] != "flat" or stack.white_level is None:
@@ -108,13 +116,12 @@ def _is_saturated(stack: FrameStack, exposure: int) -> bool:
     return float(np.mean(np.asarray(stack.counts[exposure][0]) >= stack.white_level)) > MOST_SATURATED
 
 
-def _beyond_the_range(stack: FrameStack) -> list[int]:
-    """Flats above 70 % of saturation, which is the signal of the largest temporal variance (EMVA 1288).
+def _beyond_the_range(stack: FrameStack, flats: list[int]) -> list[int]:
+    """Flats, of two frames or more, above 70 % of saturation: the signal of the largest temporal variance (EMVA 1288).
 
     If brighter ones show by a clearly smaller variance that it is: charge spills over there, or the output bends, and
     no linear model describes it. Of each level the first two frames count.
     """
-    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
     if not flats:
         return []
     darkest = min((i for i, kind in enumerate(stack.kind) if kind == "dark"), key=lambda i: stack.exposure_s[i])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import jax
 import numpy as np
 import pytest
 
@@ -134,6 +135,69 @@ def test_flats_of_several_levels_show_the_response(loss, is_bent):
     assert 50 < np.abs(curve.excess).max() < 450 and curve.excess[3] > 0 > curve.excess[-1]
     level = np.linspace(150.0, 14000.0, 50)
     np.testing.assert_allclose(curve.before(level + np.interp(level, curve.level, curve.excess)), level, rtol=1e-6)
+
+
+UNDER_LIGHT = fx.PhotoResponseNonuniformity(0.01, row_sigma=0.002, column_sigma=0.004, column_parity=0.01)
+
+
+@lru_cache
+def lit_sensor(cfa="mono", drawn=UNDER_LIGHT, shape=(96, 128), levels=(2000.0, 6000.0)):
+    """Darks, and flats in light that falls towards a corner, of one frame at the first level."""
+    rows, columns = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    light = 1 - 0.2 * rows**2 - 0.3 * columns
+    truth = model_of(*BASE, fx.DarkSignalNonuniformity(2.0), drawn, cfa=cfa)
+    frames = (8, 1, *[4] * len(levels))
+    clean = [
+        np.broadcast_to(level * light, (n, *shape)) for level, n in zip((0.0, 500.0, *levels), frames, strict=True)
+    ]
+    sensor = jax.random.key(5)
+    counts = [np.asarray(hsnoise.sample(i, of, truth, sensor_key=sensor)) for i, of in enumerate(clean)]
+    kinds = ["dark", *["flat"] * (len(levels) + 1)]
+    return hsnoise.FrameStack(counts, np.ones(len(counts)), kind=kinds, cfa=cfa, shutter="global")
+
+
+def response_of(cfa, shape=(96, 128)):
+    """The response of `lit_sensor`, from light without noise."""
+    model = NoiseModel([UNDER_LIGHT], cfa=cfa, shutter="global", exposure_s=1.0)
+    return np.asarray(hsnoise.sample(0, np.ones((1, *shape)), model, sensor_key=jax.random.key(5)))[0]
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+def test_flats_give_the_response_of_each_pixel(cfa):
+    stack = lit_sensor(cfa)
+    found = closed(model_of(*BASE, fx.PhotoResponseNonuniformity(0.02), cfa=cfa), stack)
+    assert "photo_response_nonuniformity" in found.replaced and "photo_response_nonuniformity" not in found.params
+    measured, truth = np.asarray(found.params["measured_map"].photo_response), response_of(cfa)
+    # Light tells 1 % to 0.7 %: the posterior is 0.57 % wide, about its mean as about the truth.
+    assert np.std(measured - truth) < 0.0085 and np.std(measured) == pytest.approx(np.std(truth), rel=0.05)
+    width = 1 if cfa == "mono" else 2
+    odd = np.arange(128) // width % 2 == 1
+    parity, of_truth = (one[:, odd].mean() - one[:, ~odd].mean() for one in (measured, truth))
+    assert parity == pytest.approx(of_truth, abs=4 * 0.007 * np.sqrt(4 / measured.size))
+    # Of a column's response a seventh goes with the smooth light.
+    assert np.std(measured.mean(0) - truth.mean(0)) < 0.002 < 0.006 < np.std(truth.mean(0))
+    after, before = ({g: x for g, x in one.groups.items() if "flats" in g} for one in (found.comparison, found.before))
+    assert max(after.values()) < 4 < 20 < max(before.values()) and "flats, column responses" in after
+
+
+def test_flats_of_one_frame_leave_the_response_to_its_law():
+    stack = lit_sensor().select(exposures=[0, 1])
+    found = closed(model_of(*BASE, fx.PhotoResponseNonuniformity(0.01)), stack)
+    assert found.params["measured_map"].photo_response is None and "photo_response_nonuniformity" in found.params
+    assert "flats, noise" not in found.comparison.groups
+
+
+@pytest.mark.parametrize(("bends", "loss"), [("sensor", 6e-6), ("lamp", 0.0)])
+def test_a_bent_response_is_the_sensors_if_the_noise_of_flats_bends_too(bends, loss):
+    exposures_s, shape = np.array([1.0, 2.0, 4.0, 6.0, 8.0, 10.0]), (64, 96)
+    truth = model_of(*BASE, fx.Nonlinearity(loss))
+    light = 1000 * exposures_s * (1.0 if bends == "sensor" else 1 - 6e-6 * 1000 * exposures_s)
+    counts = [np.asarray(hsnoise.sample(i, np.full((4, *shape), of), truth)) for i, of in enumerate(light)]
+    darks = np.asarray(hsnoise.sample(9, np.zeros((8, *shape)), truth))
+    kinds = ["dark", *["flat"] * len(exposures_s)]
+    stack = hsnoise.FrameStack([darks, *counts], [1.0, *exposures_s], kind=kinds, shutter="global")
+    found = closed(model_of(*BASE[:1], *BASE[2:]), stack)
+    assert ("measured_response" in found.params) is (bends == "sensor")
 
 
 def test_shares_add_up():

@@ -124,7 +124,11 @@ EXAMPLES = [
     BlackClamp([70.0, 60.0, 65.0]),
     Nonlinearity(1e-3),
     MeasuredMap(
-        np.arange(24.0).reshape(4, 6), np.linspace(0.5, 1.5, 24).reshape(4, 6), np.ones((4, 6)), growth=np.ones((4, 6))
+        np.arange(24.0).reshape(4, 6),
+        np.linspace(0.5, 1.5, 24).reshape(4, 6),
+        np.ones((4, 6)),
+        growth=np.ones((4, 6)),
+        photo_response=np.linspace(1.5, 0.5, 24).reshape(4, 6),
     ),
     MeasuredSpectrum([1.0, 2.0, 1.0], [0.5, 0.5], [1.0], [0.0, 1.0, 2.0]),
     MeasuredDistribution(2.0, [-5.94, -2.97, 2.97, 5.94]),

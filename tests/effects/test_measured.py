@@ -23,7 +23,7 @@ from hsnoise.effects import (
 )
 from hsnoise.effects.measured_distribution import knots, moments_of, normalised
 from hsnoise.effects.measured_spectrum import bins_of
-from hsnoise.model import NoiseModel, sample, sample_dark
+from hsnoise.model import NoiseModel, sample, sample_by_effect, sample_dark
 
 KEY = jax.random.key(31)
 SIGMAS = 5.0
@@ -102,6 +102,20 @@ def test_maps_give_each_pixel_its_own():
     np.testing.assert_allclose(np.median(other.std(0) / other.mean(0)), 0.2, rtol=0.05)
 
 
+def test_light_falls_on_each_pixel_by_its_response_and_dark_current_does_not():
+    response = np.random.default_rng(2).uniform(0.5, 1.5, (16, 16))
+    response /= response.mean()
+    effects = ShotNoise(), DarkCurrent(20.0), ReadNoise(1.0), MeasuredMap(photo_response=response)
+    model = NoiseModel(effects, cfa="mono", shutter="global", exposure_s=1.0)
+    expected = 100 * response + 20
+    lit = np.full((400, 16, 16), 100.0)
+    for drawn in (sample(KEY, lit, model), sample_by_effect(KEY, lit, model, exposure_s=1.0, sensor_key=KEY)):
+        drawn = np.asarray(drawn)
+        assert np.abs((drawn.mean(0) - expected) / np.sqrt((expected + 1) / 400)).max() < SIGMAS
+        np.testing.assert_allclose(drawn.var(0).mean(), expected.mean() + 1, rtol=0.02)
+    assert np.asarray(sample(KEY, np.zeros((400, 16, 16)), model)).mean() == pytest.approx(20.0, rel=0.01)
+
+
 @pytest.mark.parametrize("cfa", ["mono", "RGGB"])
 def test_beyond_the_map_come_mirrored_copies_of_the_same_colours(cfa):
     offset = np.arange(24.0).reshape(4, 6)
@@ -138,6 +152,7 @@ def test_the_response_bends_and_has_a_gradient():
     [
         (lambda: MeasuredMap(np.zeros((4, 4)), np.ones((4, 5))), "expected maps of one shape"),
         (lambda: MeasuredMap(dark_current=np.full((4, 4), 2.0)), "dark_current: expected a mean of 1, got 2"),
+        (lambda: MeasuredMap(photo_response=np.full((4, 4), 0.5)), "photo_response: expected a mean of 1, got 0.5"),
         (lambda: MeasuredMap(read_noise=np.full((4, 4), 2.0)), "read_noise: expected a mean square of 1, got 4"),
         (lambda: MeasuredMap(dark_current=-np.ones((4, 4))), "dark_current: expected finite numbers >= 0"),
         (lambda: MeasuredSpectrum(row=[-1.0, 3.0]), "row: expected finite numbers >= 0"),
