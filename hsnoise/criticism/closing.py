@@ -18,6 +18,7 @@ from hsnoise._core.keys import named_key
 from hsnoise._core.types import RandomKey
 from hsnoise.criticism import sentences, shares
 from hsnoise.criticism.compare import Comparison, compared
+from hsnoise.criticism.held_out import with_flats
 from hsnoise.criticism.measured_curve import with_response
 from hsnoise.criticism.measured_light import with_photo_response
 from hsnoise.criticism.measured_maps import Sensor
@@ -74,8 +75,12 @@ class ClosedModel:
 
     @property
     def helps(self) -> bool:
-        """Whether it comes nearer than the named effects alone: where most counts clip, maps cannot be measured."""
-        return self.comparison.error < self.before.error
+        """Whether all groups of statistics together come nearer than with the named effects alone.
+
+        Where most counts clip, maps cannot be measured. The error is of the worst group, which may be one that neither
+        model describes.
+        """
+        return self.comparison.total < self.before.total
 
     @property
     def largest_unexplained(self) -> Share | None:
@@ -118,7 +123,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
     darks, flats = repeated_darks(stack), _flats(stack)
     judging = darks if held_out is None else repeated_darks(held_out)
-    judge = Portion.of(judging if flats is None else FrameStack.join(judging, flats))
+    judge = Portion.of(judging if flats is None else with_flats(judging, flats))
     with jax.enable_x64(True):
         models = _Closing.of(darks, seed).with_light(params, stack, flats)
     found, comparison = _nearest(models, judge, seed)

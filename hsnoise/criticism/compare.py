@@ -80,6 +80,11 @@ class Comparison:
         return max(self.groups, key=self.groups.__getitem__)
 
     @property
+    def total(self) -> float:
+        """The misfits of all groups together: the error is that of the worst alone."""
+        return sum(self.groups.values())
+
+    @property
     def largest_unexplained(self) -> Share | None:
         """The component of which the largest part of the whole variance is not reproduced beyond chance, if any."""
         return shares.largest_unexplained(self.shares)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hsnoise.criticism import sentences
 from hsnoise.criticism.outcomes import Improvement
+from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.portion import Portion
@@ -33,6 +34,18 @@ def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, Fram
     of_darks = iter(kept)
     frames = [slice(next(of_darks)) if kind == "dark" else slice(None) for kind in stack.kind]
     return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
+
+
+def with_flats(darks: FrameStack, flats: FrameStack) -> FrameStack:
+    """Darks, which may be of a part of the sensor, with the same part of its flats."""
+    if darks.window != flats.window and darks.window is not None:
+        whole = replaced(flats, window=flats.window or (0, 0, *flats.shape))
+        rows, columns = (
+            slice(first - before, first - before + size)
+            for first, before, size in zip(darks.window, whole.window[:2], darks.shape, strict=False)
+        )
+        flats = whole.select(rows=rows, columns=columns)
+    return FrameStack.join(darks, flats)
 
 
 def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
@@ -70,7 +83,7 @@ class Judge:
         """Of the darks held out from a fit, and of its flats."""
         before = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
         flats = [i for i, kind in enumerate(fitted.kind) if kind == "flat"]
-        stack = FrameStack.join(held_out, fitted.select(exposures=flats)) if flats else held_out
+        stack = with_flats(held_out, fitted.select(exposures=flats)) if flats else held_out
         return Judge(Portion.of(stack, before=(*before, *[0] * len(flats))), True, seed)
 
     @cached_property

@@ -155,8 +155,7 @@ def improved(
         found = closed(story.fit, fitted, held_out=held_out, seed=seed)
         if found.helps:
             return replace(story, closed=found)
-        errors = found.before.error, found.comparison.error
-        return replace(story, left_open=sentences.left_open(*errors))
+        return replace(story, left_open=sentences.left_open(found.before.total, found.comparison.total))
     return story
 
 

@@ -311,10 +311,10 @@ def closed(error: float, worst: Share | None) -> str:
 
 
 def left_open(named: float, closed: float) -> str:
-    """Why a model was not closed: its errors without and with measured components."""
+    """Why a model was not closed: its misfits of all groups without and with measured components."""
     return (
-        f"Not closed with measured components: with them the error of frames held out is {number(closed)}, without"
-        f" {number(named)}."
+        f"Not closed with measured components: with them the total misfit of frames held out is {number(closed)},"
+        f" without {number(named)}."
     )
 
 

@@ -230,7 +230,7 @@ def together(before: Step, after: Step) -> str:
     """What fell, in words, where an addition was kept although the error, that of the worst group, did not fall."""
     if after.comparison.error <= before.comparison.error:
         return ""
-    return sentences.fell_together(*(sum(step.comparison.groups.values()) for step in (before, after)))
+    return sentences.fell_together(*(step.comparison.total for step in (before, after)))
 
 
 def _because(before: Step, after: Step) -> str:

@@ -11,8 +11,9 @@ import hsnoise
 import hsnoise.effects as fx
 from hsnoise.criticism import held_out as of_frames
 from hsnoise.criticism.acceptance import judged
-from hsnoise.criticism.held_out import LEAST_DRAWS, Judge
+from hsnoise.criticism.held_out import LEAST_DRAWS, Judge, split_frames, with_flats
 from hsnoise.criticism.outcomes import Improvement, Refused
+from hsnoise.frames.joining import replaced
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
 
@@ -109,3 +110,19 @@ def test_flats_are_judged_beside_the_darks_held_out():
     darks = judge.without_flats
     assert darks.portion.frames.kind == ("dark",) * 4 and darks.portion.before == (6, 6, 6, 6)
     assert darks.improvement(MODEL, ROWS, 1).cost == 0
+
+
+def test_flats_are_judged_on_the_part_of_the_sensor_that_was_held_out():
+    """Of large captures some columns are held out; flats of the whole sensor would count as taken elsewhere."""
+    rng = np.random.default_rng(0)
+    counts = [rng.integers(90, 110, (n, 64, 160)).astype(np.uint16) for n in (8, 2)]
+    whole = hsnoise.FrameStack(counts, [1.0, 1.0], kind=["dark", "flat"], shutter="global")
+    placed = replaced(whole, window=(0, 0, 64, 160))
+    darks = placed.select(exposures=[0], columns=(40, 120))
+    for of in (whole, placed):
+        joined = with_flats(darks, of.select(exposures=[1]))
+        assert joined.kind == ("dark", "flat") and joined.window == (0, 40, 64, 160) and joined.elsewhere is None
+        np.testing.assert_array_equal(joined.counts[1], counts[1][:, :, 40:120])
+    assert with_flats(whole.select(exposures=[0]), whole.select(exposures=[1])).shape == (64, 160)
+    fitted, held_out = split_frames(darks, whole)
+    assert Judge.of(fitted, held_out, 0).portion.frames.kind == ("dark", "flat")
