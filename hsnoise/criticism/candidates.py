@@ -22,6 +22,7 @@ from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.pixels.row_groups import row_groups_in
+from hsnoise.statistics.pixels.waves import wave_in
 from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
@@ -54,6 +55,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
         levels=len(exposures_s) + part.n_exposures - len(darks),
         light_e=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
         line=moving_line(part, drawn, black_level_of(model)),
+        wave=None if (wave := wave_in(part)) is None else (wave.row_frequency, wave.column_frequency),
         places=places(part),
         code_step=code_step(part),
         row_groups=row_groups_in(part),

@@ -33,6 +33,7 @@ from hsnoise.effects.gain import Gain
 from hsnoise.effects.heavy_tailed_read_noise import HeavyTailedReadNoise
 from hsnoise.effects.hot_pixels import HotPixels
 from hsnoise.effects.image_lag import ImageLag
+from hsnoise.effects.interference import Interference
 from hsnoise.effects.measured_distribution import MeasuredDistribution
 from hsnoise.effects.measured_hits import MeasuredHits
 from hsnoise.effects.measured_map import MeasuredMap
@@ -88,6 +89,7 @@ EFFECTS: tuple[type[AbstractEffect], ...] = (
     ReadNoiseNonuniformity,
     CorrelatedReadNoise,
     PeriodicBanding,
+    Interference,
     Crosstalk,
     BrighterFatter,
     ReadoutBandwidth,
@@ -152,6 +154,7 @@ __all__ = [
     "Parameter",
     "ParameterSpec",
     "PeriodicBanding",
+    "Interference",
     "PhotoResponseNonuniformity",
     "Places",
     "RandomTelegraphNoise",

@@ -49,6 +49,7 @@ class CaptureFacts:
         levels: numbers of signal levels: exposures of the darks, and flats.
         light_e: mean photoelectrons of a pixel in the brightest flat; 0 without flats.
         line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
+        wave: cycles per row and per column of the strongest wave that crosses the darks obliquely; None without one.
         places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
         row_groups: rows, start, row_banks and column_banks of a `RowGroupNoise`; None if no rows are read together.
@@ -68,6 +69,7 @@ class CaptureFacts:
     levels: int
     light_e: float
     line: tuple[str, float]
+    wave: tuple[float, float] | None
     places: Places
     code_step: float | None
     row_groups: tuple[int, int, int, int] | None

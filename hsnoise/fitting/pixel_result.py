@@ -24,6 +24,7 @@ from hsnoise.effects import (
     ElectronMultiplication,
     FrameOffset,
     HotPixels,
+    Interference,
     MissingCodes,
     Nonlinearity,
     OddEvenPattern,
@@ -84,6 +85,7 @@ OF_PIXELS = (
     CosmicRays,
     RandomTelegraphNoise,
     PeriodicBanding,
+    Interference,
     BlackClamp,
     AmplifierGlow,
     MissingCodes,
@@ -230,8 +232,15 @@ def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
 
 
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
-    """A sinusoid over rows or columns, and rows that are read together."""
+    """Sinusoids over rows or columns, or over both, and rows that are read together."""
     found = {}
+    if (crossing := pixel.wave) is not None:
+        amplitude, g = np.sqrt(2 * crossing.variance_dn2), float(gain.mean())
+        found["interference"] = {
+            "amplitude": (amplitude / g, crossing.error_dn2 / amplitude / g),
+            "row_frequency": (crossing.row_frequency, np.inf),
+            "column_frequency": (crossing.column_frequency, np.inf),
+        }
     if (wave := pixel.channels[0].banding) is not None:
         amplitude, g = np.sqrt(2 * wave[1].variance_dn2), float(gain[0])
         size = amplitude / g, wave[1].error_dn2 / amplitude / g

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS
+from hsnoise.statistics.pixels.waves import Wave, without_wave
 
 NEAR, FAR = np.arange(1, 5), np.arange(9, 17)  # pixels apart: what is measured, and what is common to a row
 MOST_PAIRS, MOST_PIXELS = 4, 1 << 20  # of frames, and of one frame
@@ -46,17 +47,22 @@ class Ringing(NamedTuple):
     memory: tuple[float, float]
 
 
-def along_rows(counts: np.ndarray, colours: int, rows: np.ndarray | None = None) -> Along | None:
+def along_rows(
+    counts: np.ndarray, colours: int, rows: np.ndarray | None = None, wave: Wave | None = None
+) -> Along | None:
     """Of frames [frame, row, column] of one exposure, `colours` taking turns in a row; None if they do not show it.
 
     From the change between two frames, without outliers and what rows or columns share. rows: their numbers on the
-    sensor; None if they follow each other.
+    sensor; None if they follow each other. wave: that crosses these frames, and is no part of it.
     """
     pairs, columns = min(len(counts) // 2, MOST_PAIRS), counts.shape[2]
     if not pairs or columns <= 4 * FAR[-1]:
         return None
     frames = counts[: 2 * pairs, : max(MOST_PIXELS // columns, 1)].astype(np.float32)
-    several = [_bounded(change, colours) for change in frames[1::2] - frames[::2]]
+    numbers = np.arange(frames.shape[1]) if rows is None else rows[: frames.shape[1]]
+    changes = frames[1::2] - frames[::2]
+    changes = changes if wave is None else without_wave(changes, wave, numbers)
+    several = [_bounded(change, colours) for change in changes]
     variance = float(np.mean([np.mean(x**2, dtype=np.float64) for x in several])) / 2
     if variance < NARROWEST**2:
         return None
@@ -64,8 +70,7 @@ def along_rows(counts: np.ndarray, colours: int, rows: np.ndarray | None = None)
     common = np.array([far[FAR % 2 == lag % 2].mean() for lag in NEAR])  # even and odd columns may differ in it
     size = sum(x.size for x in several)
     error = float(variance * np.sqrt((1 + 2 / len(FAR)) / size))
-    numbers = np.arange(counts.shape[1]) if rows is None else rows
-    return Along(variance, near - common, error, _above(several, numbers[: frames.shape[1]]))
+    return Along(variance, near - common, error, _above(several, numbers))
 
 
 def _above(changes: list[np.ndarray], rows: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
+from hsnoise.statistics.pixels.waves import MOST_FRAMES, Spectrum, Wave, middle_of_frame, spectrum_of, wave_of
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
@@ -74,6 +75,7 @@ class Group:
     along: what pixels share of their temporal noise along rows; None if the frames do not show it.
     row_groups: rows that are read together; looked for in the shortest repeated darks, None if they do not show any.
     register: of an EMCCD, of darks that show one.
+    spectrum: of what changes between darks in two directions; None of one frame, and of flats.
     files: names of the frames' files; empty for arrays.
     """
 
@@ -87,6 +89,7 @@ class Group:
     along: Along | None
     row_groups: RowGroups | None
     register: Register | None
+    spectrum: Spectrum | None
     files: tuple[str, ...]
 
     def of(self, channel: int) -> list[Plane]:
@@ -172,6 +175,11 @@ class Survey:
         return None if self.shortest is None else self.shortest.row_groups
 
     @property
+    def wave(self) -> Wave | None:
+        """The strongest wave that crosses the darks obliquely, if any."""
+        return wave_of([group.spectrum for group in self.darks if group.spectrum is not None])
+
+    @property
     def has_exposures(self) -> bool:
         """Whether `repeated_darks` are of several exposures."""
         return len({group.exposure_s for group in self.repeated_darks}) > 1
@@ -220,6 +228,7 @@ def _group(
     kept: np.ndarray | None = None
     odd: OddLines | None = None
     means: list[np.ndarray] = []
+    middles: list[np.ndarray] = []
     clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
     for f, frame in enumerate(stack.frames(i)):
         if kept is None:
@@ -227,6 +236,7 @@ def _group(
             odd = OddLines.of(frame, step)
         kept[f] = frame[rows]
         means += [row_means(frame)] if looks_for_row_groups else []
+        middles += [middle_of_frame(frame)] if stack.kind[i] == "dark" and f < MOST_FRAMES else []
         white = np.inf if stack.white_level is None else stack.white_level
         for p in range(step * step):
             plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
@@ -243,10 +253,12 @@ def _group(
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
     groups = row_groups_of(np.stack(means), first_row, planes[0].banding.get("row")) if means else None
+    spectrum = spectrum_of(middles, step)
     of_frames = (
-        along_rows(kept, step, rows),
+        along_rows(kept, step, rows, wave_of([] if spectrum is None else [spectrum])),
         groups,
         register_of(kept) if step == 1 and stack.kind[i] == "dark" else None,
+        spectrum,
         tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
     )
     of_codes = int(np.gcd.reduce(kept[0].ravel()[:: max(1, kept[0].size // MOST_CODES)].astype(np.int64)))

@@ -1,0 +1,76 @@
+"""Interference: a sinusoid across the frame, along rows and columns at once, its phase new in each frame."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hsnoise._core.types import Frames, RandomKey, Scalar, cfa_tile
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
+from hsnoise.effects._facts import CaptureFacts, Maker, either_side
+from hsnoise.effects._parameters import param
+
+
+class Interference(AbstractEffect):
+    """Offset amplitude * sin(2 pi (row_frequency i + column_frequency j) + phase) of row i and column j, e-.
+
+    A clock or a supply that swings faster than rows are read couples into the pixels: what it is at the start of each
+    row decides how the stripes lean. Its phase is uniform in each frame. The variance is amplitude^2 / 2.
+
+    In dark frames: oblique stripes, a herringbone or a chequerboard that move from frame to frame. Waves along rows or
+    columns alone are `periodic_banding`. A fit takes the frequencies from the strongest wave, and holds them.
+
+    Attributes:
+        after_gain: whether it arises after the gain: equal in DN in all colours, and independent of the row gain.
+            Its electrons are then DN divided by the mean gain of the pixels.
+
+    Reference: Janesick, *Photon Transfer*, SPIE 2007 (pick-up noise); EMVA Standard 1288, release 4.0, 2021
+    (spectrograms).
+    """
+
+    name: ClassVar[str] = "interference"
+    stage: ClassVar[Stage] = Stage.READ
+    selection_nats: ClassVar[float] = 5.0  # its frequencies are those of the highest of all waves of the capture
+    amplitude: Scalar = param("e-", low=0, amplitude=True, doc="amplitude of the sinusoid")
+    row_frequency: Scalar = param("cycles/pixel", low=-0.5, high=0.5, held=True, doc="cycles per row; fits hold it")
+    column_frequency: Scalar = param("cycles/pixel", low=0, high=0.5, held=True, doc="cycles per column; fits hold it")
+    after_gain: bool = eqx.field(static=True, default=False)
+
+    def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
+        frames, rows, columns = signal.shape
+        # Turns of each line are folded first: thousands of turns have no digits for a phase in single precision.
+        down = jnp.arange(rows, dtype=signal.dtype)[None, :, None] * self.row_frequency % 1
+        across = jnp.arange(columns, dtype=signal.dtype)[None, None] * self.column_frequency % 1
+        phase = jax.random.uniform(key, (frames, 1, 1), signal.dtype)
+        wave = self.amplitude * jnp.sin(2 * np.pi * (down + across + phase))
+        return signal + capture.offset(wave, self.after_gain)
+
+    @classmethod
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if facts.wave is None:
+            return None
+        row, column = facts.wave
+        # A tenth of the read noise: one point of the spectrum of two directions shows it.
+        return lambda size, rng: cls(0.1 * size * facts.read_noise_e, row, column, either_side(rng))
+
+    def components(self, capture: Capture) -> dict[str, float]:
+        step = len(cfa_tile(capture.cfa))
+        whole = capture.offset_variance(self.amplitude**2 / 2, self.after_gain)
+        # In pixels of one colour a wave may turn slowly along an axis: shares of it in the means of lines and frames.
+        rows, columns = (n // step for n in capture.shape)
+        down = _in_mean(rows, step * float(self.row_frequency))
+        across = _in_mean(columns, step * float(self.column_frequency))
+        temporal = whole * (1 - down) * (1 - across) * rows * columns / ((rows - 1) * (columns - 1))
+        of_rows = whole * (1 - down) * across * rows / (rows - 1) - temporal / columns
+        of_columns = whole * down * (1 - across) * columns / (columns - 1) - temporal / rows
+        frame = whole * down * across - of_rows / rows - of_columns / columns - temporal / (rows * columns)
+        return {"frame": frame, "row_x_frame": of_rows, "column_x_frame": of_columns, "temporal": temporal}
+
+
+def _in_mean(lines: int, frequency: float) -> float:
+    """The share of the power of a sinusoid that is in its mean over so many lines."""
+    return float(abs(np.exp(2j * np.pi * frequency * np.arange(lines)).mean()) ** 2)
