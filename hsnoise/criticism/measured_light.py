@@ -16,6 +16,7 @@ from hsnoise.simulation.draws import light_of, photoelectrons
 from hsnoise.statistics.apart import Apart
 
 MOST_LEVELS = 4  # of light: those that tell most
+HOT = 0.1  # of the light: errors of so large a dark signal would be those of the response, and it may saturate
 DARKEST = 0.1  # of the median light: below, what a pixel reads is not its response
 
 
@@ -23,7 +24,7 @@ def with_photo_response(model: NoiseModel, flats: FrameStack, rng: np.random.Gen
     """The model, which has a map of its pixels, with their response to light, in place of a law over pixels.
 
     flats: of two frames or more and of any light. The response is what a pixel has beside the smooth light of a flat;
-    where that is darker than DARKEST of its median, it is taken as 1.
+    where that is darker than DARKEST of its median, and in pixels with a dark signal of HOT of it, it is taken as 1.
     """
     seen = [_relative(model, flats, i) for i in _telling(model, flats)]
     if not seen:
@@ -55,7 +56,7 @@ def _relative(model: NoiseModel, flats: FrameStack, exposure: int) -> Apart:
         offset_dn = offset_dn + exposure_s * np.asarray(whole.growth)
     if whole.dark_current is not None:
         dark_e = float(model["dark_current"].rate) * exposure_s * (np.asarray(whole.dark_current) - 1)
-    is_lit = light > DARKEST * np.median(light)
+    is_lit = (light > DARKEST * np.median(light)) & (dark_e < HOT * light)
     light = np.where(is_lit, light, np.inf)
 
     def relative(frame: np.ndarray) -> np.ndarray:

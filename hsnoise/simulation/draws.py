@@ -19,6 +19,7 @@ from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
+SPIKE = 8.0  # deviations of a pixel from the median of those around it
 SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
 
 
@@ -116,7 +117,8 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
     """Mean of an exposure [row, column], DN, of each plane of the Bayer pattern without what pixels differ by.
 
     A cubic surface, which goes on to the edges, and what is left of it, smoothed: the light of real flats has edges
-    of its own (a slit, dust, a vignette).
+    of its own (a slit, dust, a vignette). Single pixels that lie far off, such as hot ones, do not light their
+    surroundings.
     """
     mean = np.mean([frame.astype(np.float32) for frame in like.frames(exposure)], axis=0, dtype=np.float64)
     step, smooth = len(cfa_tile(like.cfa)), np.empty(like.shape)
@@ -124,6 +126,13 @@ def _illumination_dn(like: FrameStack, exposure: int) -> np.ndarray:
         plane = mean[r::step, c::step]
         down, across = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n), SURFACE_DEGREE) for n in plane.shape)
         surface = down @ (np.linalg.pinv(down) @ plane @ np.linalg.pinv(across).T) @ across.T
-        left = scipy.ndimage.gaussian_filter(plane - surface, SMOOTH_PIXELS, mode="mirror")
-        smooth[r::step, c::step] = surface + left
+        left = _without_spikes(plane - surface)
+        smooth[r::step, c::step] = surface + scipy.ndimage.gaussian_filter(left, SMOOTH_PIXELS, mode="mirror")
     return smooth
+
+
+def _without_spikes(plane: np.ndarray) -> np.ndarray:
+    """The plane with the median of their surroundings in place of single pixels that lie far from it."""
+    beside = scipy.ndimage.median_filter(plane, 3, mode="mirror")
+    off = np.abs(plane - beside)
+    return np.where(off > SPIKE * 1.4826 * float(np.median(off)), beside, plane)

@@ -86,14 +86,19 @@ def wave_of(spectra: Sequence[Spectrum]) -> Wave | None:
     seen = np.where(slow, 0.0, power)
     r, c = np.unravel_index(int(seen.argmax()), seen.shape)
     around = max(_beside(seen[:, c], int(r), wraps=True), _beside(seen[r], int(c), wraps=False))
-    if not seen[r, c] > SHARP * max(around, float(np.median(power))):
+    near = np.take(power[:, max(c - 1, 0) : c + 2], [r - 1, r, r + 1], axis=0, mode="wrap")
+    # Beside a band it may be the foot of its peak.
+    if near.max() > power[r, c] or not seen[r, c] > SHARP * max(around, float(np.median(power))):
         return None
     row = _off(np.take(power[:, c], [r - 1, r, r + 1], mode="wrap"))
     column = _off(power[r, c - 1 : c + 2]) if c < power.shape[1] - 1 else 0.0
     # Alternating signs are one wave; any other is the sum of two that turn in opposite senses.
     is_real = c == power.shape[1] - 1 and 2 * r == rows
     size = (1.0 if is_real else 2.0) / (_seen(row) * _seen(column))
-    error = size * np.sqrt(max(float(square[r, c] - power[r, c] ** 2), 0.0) / max(weights.sum() - 1, 1))
+    scatter = np.sqrt(max(float(square[r, c] - power[r, c] ** 2), 0.0) / max(weights.sum() - 1, 1))
+    # What n random phases leave of a wave's power in the differences from their mean scatters by 1 / (n - 1).
+    of_phases = power[r, c] * np.sqrt(np.sum((weights / (weights - 1)) ** 2)) / weights.sum()
+    error = size * max(scatter, of_phases)
     frequency = (float(r) + row) / rows
     return Wave(frequency - (frequency > 0.5), (float(c) + column) / columns, size * (power[r, c] - around), error)
 
