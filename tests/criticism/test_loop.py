@@ -354,7 +354,7 @@ def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_ou
 )
 def test_what_fell_is_told_where_the_error_did_not(groups, told):
     def step(*groups):
-        comparison = SimpleNamespace(error=max(groups), groups=dict(enumerate(groups)))
+        comparison = SimpleNamespace(error=max(groups), total=sum(groups))
         return Step(None, comparison, None, None, 0.0, ())
 
     assert together(step(10.0, 15.0), step(*groups)) == told
