@@ -41,7 +41,9 @@ def model_of(*effects, cfa="mono"):
 @lru_cache
 def wild_sensor(cfa="mono", frames=12, shape=(128, 160)):
     """Every second frame of a sensor, and the others."""
-    blank = [np.arange(frames * shape[0] * shape[1], dtype=np.uint16).reshape(frames, *shape)] * len(EXPOSURES_S)
+    blank = [(np.arange(frames * shape[0] * shape[1]) % 50021).astype(np.uint16).reshape(frames, *shape)] * len(
+        EXPOSURES_S
+    )
     like = hsnoise.FrameStack(blank, EXPOSURES_S, cfa=cfa, shutter="global")
     whole = draw_capture(77, model_of(*BASE, *WILD, cfa=cfa), like)
     return tuple(whole.with_counts([of[half::2] for of in whole.counts], None) for half in (0, 1))
