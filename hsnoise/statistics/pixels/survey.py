@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -174,7 +175,7 @@ class Survey:
         """Rows that are read together, of the shortest darks."""
         return None if self.shortest is None else self.shortest.row_groups
 
-    @property
+    @cached_property
     def wave(self) -> Wave | None:
         """The strongest wave that crosses the darks obliquely, if any."""
         return wave_of([group.spectrum for group in self.darks if group.spectrum is not None])

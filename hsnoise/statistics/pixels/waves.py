@@ -77,8 +77,8 @@ def wave_of(spectra: Sequence[Spectrum]) -> Wave | None:
     """The strongest wave in exposures of a sensor; None if no point of their spectrum stands out."""
     if not spectra:
         return None
-    least = min(float(np.median(one.power)) for one in spectra)
-    alike = [one for one in spectra if np.median(one.power) <= ALIKE * least]
+    usual = [float(np.median(one.power)) for one in spectra]
+    alike = [one for one, of in zip(spectra, usual, strict=True) if of <= ALIKE * min(usual)]
     weights = np.array([one.n_frames for one in alike], float)
     power, square = (np.average([of[i] for of in alike], 0, weights) for i in (0, 1))
     (rows, columns), cell = alike[0].shape, alike[0].cell
