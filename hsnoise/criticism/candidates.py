@@ -21,6 +21,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
+from hsnoise.statistics.pixels.comb import comb_in
 from hsnoise.statistics.pixels.row_groups import row_groups_in
 from hsnoise.statistics.pixels.waves import wave_in
 from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
@@ -58,6 +59,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
         wave=None if (wave := wave_in(part)) is None else (wave.row_frequency, wave.column_frequency),
         places=places(part),
         code_step=code_step(part),
+        comb=None if (comb := comb_in(part)) is None else (comb.sigma, tuple(comb.errors.tolist())),
         row_groups=row_groups_in(part),
     )
 

@@ -52,6 +52,7 @@ class CaptureFacts:
         wave: cycles per row and per column of the strongest wave that crosses the darks obliquely; None without one.
         places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
+        comb: rms of the errors of the codes' widths, DN, and the errors of a period; None if none is certain.
         row_groups: rows, start, row_banks and column_banks of a `RowGroupNoise`; None if no rows are read together.
     """
 
@@ -72,6 +73,7 @@ class CaptureFacts:
     wave: tuple[float, float] | None
     places: Places
     code_step: float | None
+    comb: tuple[float, tuple[float, ...]] | None
     row_groups: tuple[int, int, int, int] | None
 
     @property

@@ -31,6 +31,7 @@ from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.classes import Levels, hot_from, kept_of, levels_of, slope_over
+from hsnoise.statistics.pixels.comb import Comb
 from hsnoise.statistics.pixels.glow import Glow, glow_of, glow_of_pixels, without_glow
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
@@ -118,6 +119,7 @@ class PixelFit:
     taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
     parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
     wave: what crosses the frame obliquely and moves from frame to frame. It is in no read noise.
+    comb: codes of unequal width, if they are.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -129,6 +131,7 @@ class PixelFit:
     code_step: int
     parity_told: bool
     wave: Wave | None
+    comb: Comb | None
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -155,7 +158,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.wave
+    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.wave, found.comb
     return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 

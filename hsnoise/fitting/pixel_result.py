@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise.effects import (
     AbstractEffect,
+    AdcNonuniformity,
     AmplifierGlow,
     BlackClamp,
     BlackShading,
@@ -89,6 +90,7 @@ OF_PIXELS = (
     BlackClamp,
     AmplifierGlow,
     MissingCodes,
+    AdcNonuniformity,
     ElectronMultiplication,
 )
 LEAST_NOISE_SPREAD = 0.05  # smaller ones hardly show
@@ -181,6 +183,8 @@ def _population(
         found["black_shading"] = {"amplitude": (one.amplitude_dn, one.error_dn), "length": (one.length, 0.0)}
     found |= {name: {"sigma": of.sigma} for name, of in shared.items()}
     found |= {"missing_codes": {"gain": (float(pixel.code_step), np.inf)}} if pixel.code_step > 1 else {}
+    if (comb := pixel.comb) is not None:
+        found["adc_nonuniformity"] = {"sigma": (comb.sigma, comb.error)}
     found |= {} if pixel.taps is None else of_taps(pixel.taps, float(gain.mean()))
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
@@ -337,6 +341,8 @@ def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[
         return dict(zip(("rows", "start", "row_banks", "column_banks"), groups.layout, strict=True))
     if name in ("tap_offsets", "tap_gains") and pixel.taps is not None:
         return {"taps": pixel.taps.columns, "row_taps": pixel.taps.rows}
+    if name == "adc_nonuniformity" and (comb := pixel.comb) is not None:
+        return {"period": len(comb.errors), "pattern": np.round(comb.errors / comb.sigma, 2)}
     jumps = pixel.channels[0].jumps
     if name == "random_telegraph_noise" and jumps is not None:
         return {"double_sampling": jumps.double_sampling}

@@ -16,6 +16,7 @@ from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouri
 from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
+from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_of
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
@@ -77,6 +78,7 @@ class Group:
     row_groups: rows that are read together; looked for in the shortest repeated darks, None if they do not show any.
     register: of an EMCCD, of darks that show one.
     spectrum: of what changes between darks in two directions; None of one frame, and of flats.
+    codes: how often the central codes occur; None where they are too few to tell their widths.
     files: names of the frames' files; empty for arrays.
     """
 
@@ -91,6 +93,7 @@ class Group:
     row_groups: RowGroups | None
     register: Register | None
     spectrum: Spectrum | None
+    codes: Histogram | None
     files: tuple[str, ...]
 
     def of(self, channel: int) -> list[Plane]:
@@ -180,6 +183,11 @@ class Survey:
         """The strongest wave that crosses the darks obliquely, if any."""
         return wave_of([group.spectrum for group in self.darks if group.spectrum is not None])
 
+    @cached_property
+    def comb(self) -> Comb | None:
+        """The pattern of the widths of codes, if all exposures share one."""
+        return comb_of([group.codes for group in self.groups if group.codes is not None])
+
     @property
     def has_exposures(self) -> bool:
         """Whether `repeated_darks` are of several exposures."""
@@ -260,6 +268,7 @@ def _group(
         groups,
         register_of(kept) if step == 1 and stack.kind[i] == "dark" else None,
         spectrum,
+        histogram_of(kept, white),
         tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
     )
     of_codes = int(np.gcd.reduce(kept[0].ravel()[:: max(1, kept[0].size // MOST_CODES)].astype(np.int64)))
