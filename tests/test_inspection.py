@@ -129,6 +129,20 @@ def test_darks_that_are_flats(rng):
     assert "light got in, or they are flats" in findings([darks(rng, 0), flats(rng, 3000, 8)], [0, 8])
 
 
+def test_two_kinds_of_frames_among_the_darks(rng):
+    counts = np.concatenate([darks(rng, 1, 3), flats(rng, 3000, 2)])
+    assert "frame 3 and 1 more of the 5 darks of 1 s lie" in findings([counts], [1.0])
+    fit = hsnoise.fit(hsnoise.FrameStack([counts], [1.0]))
+    assert not fit.trustworthy and "are they lit, or taken at another exposure" in str(fit)
+
+
+def test_the_odd_one_of_three_frames(rng):
+    counts = darks(rng, 0, 3)
+    counts[0] -= 2
+    found = findings([counts], [0.0])
+    assert "frame 0 (darks of 0 s) lies 2.0 DN below the later ones" in found and "frame 1" not in found
+
+
 def test_a_camera_that_subtracts_its_dark_current(rng):
     counts = []
     for i, seconds in enumerate((0, 4, 8)):

@@ -56,6 +56,33 @@ def test_the_gain_of_each_quarter(known, rng):
     assert doubt.startswith("2 x 2 outputs") and "--roi 0:60,0:128" in doubt
 
 
+def test_uneven_light_is_no_gain(rng):
+    """Light that falls by half over each output, in another direction, and columns that see none."""
+    x = np.arange(SHAPE[1]) / SHAPE[1]
+    light = (
+        np.array([2000, 8000])[:, None, None]
+        * (1 - 0.5 * (x > 0.5) * (2 * x - 1))
+        * np.linspace(1, 0.6, SHAPE[0])[:, None]
+    )
+    light[..., :6] = light[..., 126:130] = 0
+    stack = camera(np.ones((2, 2)), [[0, 200], [-150, 60]], rng, light=list(light))
+    fit = hsnoise.fit(stack)
+    assert np.abs(fit.transfer.taps.gain - 1).max() < 4 * fit.transfer.taps.gain_error.max() < 0.06
+    assert "tap_gains" not in fit.added
+    assert abs(fit.table["gain"][0] - 1) < 4 * fit.table["gain"][1]
+
+
+def test_single_darks_beside_repeated_ones_show_no_signal_that_is_not_there(rng):
+    """Offsets of outputs lie far apart: half of the pixels above the gap, half below."""
+    stack = camera(np.ones((2, 2)), [[-50, 180], [40, -170]], rng, exposures=(1.0, 12.0), light=(2000,), gain=1.0)
+    counts, drift = [stack.counts[0], stack.counts[1][:1], stack.counts[2]], np.rint(3 * rng.standard_normal(FRAMES))
+    counts[0] = (counts[0] + drift[:, None, None]).astype(np.uint16)
+    fit = hsnoise.fit(hsnoise.FrameStack(counts, [1.0, 12.0, 1.0], kind=["dark", "dark", "flat"]))
+    rate, error = fit.table["dark_current.rate"][:2]
+    assert abs(rate - 1.0) < 4 * error < 2.0
+    assert "hot_pixels" not in fit.added
+
+
 def test_outputs_that_are_alike_but_for_offsets_are_no_doubt(rng):
     """Beside columns that differ, too."""
     columns = rng.normal(0, 0.5, (1, SHAPE[1]))

@@ -128,6 +128,11 @@ def overscan(text: str) -> str | tuple[Any, Any]:
     return rows, columns
 
 
+def hdu(text: str) -> int | str:
+    """The number of an HDU, or its name."""
+    return int(text) if text.strip().isdecimal() else text
+
+
 def roi(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         (r0, r1), (c0, c1) = (map(int, span.split(":")) for span in text.split(","))

@@ -29,6 +29,7 @@ def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
         "row_axis": args.row_axis,
         "roi": args.roi,
         "overscan": args.overscan,
+        "hdu": args.hdu,
     }
     groups = _captures(paths, exposure_s=_one_or_list(args.exposure), kind=args.kind, **options)
     if args.exposure is not None and len(args.exposure) > 1:
@@ -43,7 +44,18 @@ def load_capture(paths: list[str], args: argparse.Namespace) -> FrameStack:
 def same_capture(args: argparse.Namespace) -> str:
     """Command-line words that load the capture of `args` again."""
     words = [*args.paths]
-    for name in ("exposure", "kind", "cfa", "black_level", "white_level", "shutter", "row_axis", "roi", "overscan"):
+    for name in (
+        "exposure",
+        "kind",
+        "cfa",
+        "black_level",
+        "white_level",
+        "shutter",
+        "row_axis",
+        "roi",
+        "overscan",
+        "hdu",
+    ):
         value = getattr(args, name)
         if value is not None and not (name == "row_axis" and value == 0):
             words += [f"--{name.replace('_', '-')}", _in_words(value)]

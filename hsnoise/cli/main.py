@@ -67,6 +67,7 @@ OPTIONS = {
     "cfa": "--cfa",
     "roi": "--roi",
     "overscan": "--overscan",
+    "hdu": "--hdu",
     "shutter": "--shutter",
     "kind": "--kind",
     "flats": "--flats",

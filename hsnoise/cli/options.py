@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hsnoise._core.output import FRAME_FORMATS
-from hsnoise._core.parsing import Parser, cfa, count, list_of_seconds, minutes, numbers, overscan, positive, roi
+from hsnoise._core.parsing import Parser, cfa, count, hdu, list_of_seconds, minutes, numbers, overscan, positive, roi
 from hsnoise._core.types import BAYER_CFAS, SHUTTERS
 from hsnoise.enhance.training.options import shape_of, training_arguments
 from hsnoise.simulation.cameras import canon_5d3, grasshopper3
@@ -207,6 +207,7 @@ def _capture_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|R0:R1,C0:C1",
         help="remove rows or columns that see no light: auto, or rows,columns with : for all (:,1024:1050)",
     )
+    group.add_argument("--hdu", type=hdu, metavar="N|NAME", help="which image of FITS files that hold several")
     group.add_argument("--flats", nargs="+", metavar="PATH", help="evenly lit frames, several of each brightness")
     group.add_argument("--flats-exposure", type=list_of_seconds, metavar="S[,S...]", help="their exposure in seconds")
 

@@ -21,7 +21,13 @@ def growth_of_means(found: Survey, c: int) -> tuple[tuple[float, float], tuple[f
     t = np.array([g.exposure_s for g in darks])
     planes = [g.of(c) for g in darks]
     narrow = any(p.narrow_dn is not None for of in planes for p in of)
-    level = np.array([np.mean([_level(p, narrow) for p in of]) for of in planes])
+    reference = None if found.shortest is None else found.shortest.of(c)
+    level = np.array(
+        [
+            np.mean([_level(p, narrow, None if reference is None else reference[i]) for i, p in enumerate(of)])
+            for of in planes
+        ]
+    )
     frames = [
         np.mean([p.frame_means_dn if p.halves is None else p.halves.frame_means_dn for p in of], axis=0)
         for of in planes
@@ -60,15 +66,24 @@ def _line(exposure_s: np.ndarray, level_dn: np.ndarray, error_dn: np.ndarray) ->
     return float(theta[1]), float(np.sqrt(covariance[1, 1]))
 
 
-def _level(plane: Plane, narrow: bool) -> float:
+def _level(plane: Plane, narrow: bool, reference: Plane | None) -> float:
     """Level of the typical pixel of a plane, DN; hits and hot pixels do not move it.
 
+    reference: the plane of repeated darks. The median pixel of a single frame, noise and all, is not that of means:
+    there each pixel is compared with what it has here, so that fixed patterns do not matter.
     narrow: whether noise at some exposure is below a count; most pixels have the same one there, which is the median,
     so that it is the mean pixel at all exposures.
     """
     if narrow:
         return float(plane.row_mean_dn.mean())
-    return float(np.median(plane.row_mean_dn if plane.halves is None else plane.halves.level_dn))
+    if plane.single_dn is None:
+        return float(np.median(plane.halves.level_dn))
+    # Counts are whole: their median would be, too.
+    single = plane.single_dn + np.random.default_rng(0).uniform(-0.5, 0.5, plane.single_dn.shape)
+    if reference is None:
+        return float(np.median(single))
+    typical = reference.halves.level_dn
+    return float(np.median(typical) + np.median(single - typical.mean(0)))
 
 
 def is_unlit(found: Survey, growth: float) -> bool:

@@ -75,6 +75,23 @@ def test_vignetting_is_no_overscan(tmp_path):
     assert load(tmp_path).assumed == ()
 
 
+def test_overscan_beside_light_that_falls_toward_it(tmp_path):
+    """Columns without light at both edges, the light beside the right ones half of that in the middle."""
+    light = 8000 * np.linspace(1, 0.35, 200)
+    light[:10] = light[-10:] = 0
+    for i in range(2):
+        rng = np.random.default_rng(i)
+        for kind, level in (("bias", np.full(200, BLACK_DN)), ("flat", BLACK_DN + light)):
+            frame = rng.poisson(np.broadcast_to(level, (40, 200))).astype(np.uint16)
+            fits.writeto(tmp_path / f"{kind}{i}.fits", frame, fits.Header({"IMAGETYP": kind, "EXPTIME": 1.0}))
+    stack = load(tmp_path, overscan="auto")
+    assert stack.shape == (40, 180)
+    assert stack.assumed[:2] == (
+        "The first 10 columns were removed as overscan",
+        "The last 10 columns were removed as overscan",
+    )
+
+
 @pytest.mark.parametrize("section, told", [("[1:8,1:40]", True), ("[1:8,1:400]", False), ("none", False)])
 def test_overscan_of_headers(tmp_path, section, told):
     for i in range(2):

@@ -155,3 +155,64 @@ def test_json_beside_an_npz_file_gives_kind_and_exposure(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps({"arrays": arrays, "cfa": "RGGB"}))
     stack = hsnoise.load(tmp_path / "a.npz")
     assert list(stack.exposure_s) == [0.0, 2.5] and stack.cfa == "RGGB"
+
+
+def write_fits(path, **fields):
+    header = fits.Header()
+    for name, value in {"IMAGETYP": "dark", "EXPTIME": 1.0, **fields}.items():
+        header[name] = value
+    fits.writeto(path, frames(1)[0], header)
+
+
+@pytest.mark.parametrize(
+    ("stated", "celsius"),
+    [((-20.0, "sensor"), -20.0), (("129.995", "detector mount temp"), -143.155), ((98.0, "[K] detector"), -175.15)],
+)
+def test_cold_sensors_have_kelvins(tmp_path, stated, celsius):
+    for i in range(2):
+        write_fits(tmp_path / f"{i}.fits", CCDTEMP=stated)
+    assert hsnoise.load(tmp_path).temperature_c[0] == pytest.approx(celsius)
+
+
+def test_milliseconds_of_another_keyword(tmp_path):
+    for i in range(2):
+        header = fits.Header()
+        header["IMG_EXP"] = 1999, "Exposure (ms)"
+        fits.writeto(tmp_path / f"dark{i}.fits", frames(1)[0], header)
+    assert hsnoise.load(tmp_path).exposure_s[0] == pytest.approx(1.999)
+
+
+def test_a_spectrum_of_a_lamp_is_no_dark(tmp_path):
+    for i in range(3):
+        write_fits(tmp_path / f"{i}.fits", IMAGETYP="cal", OBJECT="arcs" if i == 2 else "bias")
+    stack = hsnoise.load(tmp_path)
+    assert stack.n_frames == (2,) and "1 frame was set aside: light frames" in " ".join(stack.assumed)
+
+
+@pytest.fixture
+def amplifiers(tmp_path):
+    """Two darks with two images each, of other levels."""
+    for i in range(2):
+        images = [fits.ImageHDU(frames(1, 4000)[0] + level, name=name) for level, name in ((0, "AMP1"), (9000, "AMP2"))]
+        primary = fits.PrimaryHDU(header=fits.Header({"IMAGETYP": "dark", "EXPTIME": 2.0}))
+        fits.HDUList([primary, *images]).writeto(tmp_path / f"{i}.fits")
+    return tmp_path
+
+
+def test_one_of_several_images_is_chosen(amplifiers):
+    with pytest.raises(ValueError, match=r"got 1 AMP1 \(32, 48\), 2 AMP2 \(32, 48\); hdu= takes one of several"):
+        hsnoise.load(amplifiers)
+    for hdu, least in ((1, 0), ("AMP1", 0), (2, 9000), ("amp2", 9000)):
+        stack = hsnoise.load(amplifiers, hdu=hdu)
+        assert stack.exposure_s[0] == 2.0 and least <= stack.frame(0, 1).min() < least + 1000
+    for wrong in (3, 0, "AMP3"):
+        with pytest.raises(ValueError, match=r"hdu=.*: expected one of the images \(number, name, shape\): 1 AMP1"):
+            hsnoise.load(amplifiers, hdu=wrong)
+    with pytest.raises(TypeError, match="hdu: expected the number or the name of an HDU, got True"):
+        hsnoise.load(amplifiers, hdu=True)
+
+
+def test_only_fits_files_have_several_images(tmp_path):
+    np.save(tmp_path / "a.npy", frames())
+    with pytest.raises(ValueError, match=r"hdu=1: expected with FITS files alone, got a\.npy"):
+        hsnoise.load(tmp_path / "a.npy", hdu=1, exposure_s=1.0)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
+from hsnoise.statistics.pixels.oddities import brighter_kind
 
 FAR = 6.0  # robust deviations from which a frame is odd
 LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least this, in DN and in units of a pixel's noise
@@ -70,7 +71,15 @@ def _levels(group: GroupFacts, darks: Sequence[GroupFacts]) -> Iterator[str]:
         if len(levels) == 2 and abs(levels[1] - levels[0]) > max(LIT * group.temporal_dn, LEAST_DN):
             yield f"The two {group.name} differ in level: {levels[0]:.1f} and {levels[1]:.1f} DN"
         return
-    rest = levels - _line(levels)
+    above = brighter_kind(levels)
+    if above is not None:
+        first, off_dn = group.in_time[int(above.argmax())].name, levels[above].mean() - levels[~above].mean()
+        yield (
+            f"{first} and {int(above.sum()) - 1} more of the {len(levels)} {group.name} lie {off_dn:.0f} DN above the"
+            " others: light got in, or their exposure or temperature differs; give flats as such, and leave others out"
+        )
+        return
+    rest = levels - (_line(levels) if len(levels) >= FEWEST else np.median(levels))
     spread = 1.4826 * np.median(np.abs(rest - np.median(rest)))
     far = np.abs(rest) > max(FAR * spread, LEAST_DN, LEAST_SHARE * group.temporal_dn)
     usual = np.flatnonzero(~far)

@@ -33,10 +33,10 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
     if method == "line" or not can_be_transferred(found):
         return False
     if not found.has_exposures:
-        # A likelihood adds nothing where flats give the gain, or bias frames none, and rows of real sensors bias it.
+        # A likelihood adds nothing where flats give the gain, and what the paper's model lacks changes the shapes.
         if summary.flats is not None:
             return has_patterns(found) or responses_differ(found)
-        return not summary.exposure_s.any() and has_patterns(found)
+        return has_patterns(found) or found.wave is not None or found.comb is not None or bool(found.along)
     fell = fall_of(found) is not None  # pedestals that jump this far look like a signal
     if variance_grows(found) and not fell:
         return False
@@ -52,7 +52,7 @@ def confirmed(result: FitResult, seen: Evidence, model) -> FitResult:
     if not failed and (summary.flats is not None or not found.has_exposures):
         return result
     pixel = seen.measured(found) if failed else seen.darks
-    if not pixel.determined:
+    if not pixel.determined and not (failed and not found.has_exposures):  # a line through one exposure says nothing
         return result
     other = partial(result_of, pixel, summary, model, result.stack)
     if failed:

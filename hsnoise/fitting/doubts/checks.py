@@ -286,9 +286,12 @@ def _signal_of_one_exposure(result: FitResult, found: Survey) -> Iterator[str]:
     if result.transfer is None or not result.has_gain or found.shortest is None or found.has_exposures:
         return
     if found.shortest.exposure_s > LONG_S and "electron_multiplication" not in result.params:
+        single = [seconds(group.exposure_s) for group in found.darks if group.exposure_s != found.shortest.exposure_s]
+        of_them = f"All darks{' of two frames or more' if single else ''} are of {seconds(found.shortest.exposure_s)}"
+        more = f" (of {', '.join(single)} there is one frame)" if single else ""
         yield (
-            f"All darks are of {seconds(found.shortest.exposure_s)}, and the shot noise of their dark signal is in the"
-            " read noise: add bias frames, or darks of another exposure."
+            f"{of_them}, and the shot noise of their dark signal is in the read noise: add bias frames, or darks of"
+            f" another exposure{more}."
         )
 
 

@@ -19,7 +19,7 @@ from hsnoise._core.types import StatedGain
 from hsnoise.frames.bayer import shift_cfa
 from hsnoise.frames.io import _emva
 from hsnoise.frames.io._apart import sort_out
-from hsnoise.frames.io._files import of_one_format, paths_of, root_of
+from hsnoise.frames.io._files import of_one_format, paths_of, reader_name, root_of
 from hsnoise.frames.io._grouping import (
     RELATIVE_TOLERANCE,
     group_by_exposure,
@@ -41,10 +41,19 @@ Groups = list[list[Recording]]
 
 
 def read_capture(
-    path: Any, *, exposure_s: Any, kind: Any, cfa: str | None, overscan: Any, progress: bool, roi: Any, **keywords: Any
+    path: Any,
+    *,
+    exposure_s: Any,
+    kind: Any,
+    cfa: str | None,
+    hdu: int | str | None,
+    overscan: Any,
+    progress: bool,
+    roi: Any,
+    **keywords: Any,
 ) -> FrameStack:
     """The work of `hsnoise.load`; `keywords` are levels, shutter and row_axis."""
-    read, root, told, source = _recordings(path, progress)
+    read, root, told, source = _recordings(path, hdu, progress)
     read = read if exposure_s is None else _with_given(read, exposure_s)
     read, about_kinds = with_kinds(read, kind, root)
     read, about_exposures = _with_exposures_of_names(read, root)
@@ -86,17 +95,20 @@ def _naming(path: Path, left_out: list[str]) -> Iterator[None]:
         raise type(error)(f"{path}: {error}" + "".join(f" ({one})" for one in left_out)) from error
 
 
-def _recordings(path: Any, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
+def _recordings(path: Any, hdu: int | str | None, progress: bool) -> tuple[list[Recording], Path, list[str], str]:
     """All recordings, the folder that holds them, what was skipped, and where their format keeps the exposure."""
     if isinstance(path, str | Path) and (Path(path) / _emva.DESCRIPTOR).is_file():
         return _emva.read(Path(path)), Path(path), [], _emva.DESCRIPTOR
     paths, passed = paths_of(path)
     root = root_of(path, paths)
     paths, reader, others = of_one_format(paths, root)
+    if hdu is not None and reader_name(paths[0]) != "_fits":
+        raise ValueError(f"{setting('hdu', hdu)}: expected with FITS files alone, got {paths[0].name}")
+    options = {} if hdu is None else {"hdu": hdu}
     console = Console(stderr=True)
     bar = progress and len(paths) >= _LONG_READ and console.is_terminal
     tracked = track(paths, "Reading headers", disable=not bar, transient=True, console=console)
-    read = [one for path in tracked for one in reader.read(path)]
+    read = [one for path in tracked for one in reader.read(path, **options)]
     for one in read:
         if min(one.counts.shape) < 1:
             raise ValueError(f"{one.path}: expected frames, got counts of shape {one.counts.shape}")

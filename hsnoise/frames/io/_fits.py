@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
+from hsnoise._core.naming import setting
 from hsnoise.frames.io._header import check_exposures, described
 from hsnoise.frames.io._recording import LEAST_DECLARED, MOST_PACKED, Recording, check_held, lazy_frames, naming
 
@@ -20,8 +21,10 @@ MOST_COLUMNS = 999
 EXPOSURE_FROM = "EXPTIME, EXPOSURE or EXP_TIME in the FITS header"
 
 
-def read(path: Path) -> list[Recording]:
+def read(path: Path, hdu: int | str | None = None) -> list[Recording]:
     """The image of a FITS file: one frame, or frames of one exposure along the slowest axis of three.
+
+    hdu: number or EXTNAME of the image's HDU, of a file with several; None for the only one.
 
     Exposure, kind, temperature, binning, gain, filter and Bayer order come from the image's header or, failing that,
     from the primary header; see `_header`.
@@ -34,7 +37,7 @@ def read(path: Path) -> list[Recording]:
         with _opened(path, disable_image_compression=True) as file:
             _check_tables(file)
         with _opened(path) as file:
-            found = _recording(path, file)
+            found = _recording(path, file, hdu)
         # Astropy only warns of a file that is cut short, and its frames fail when they are read.
         cut = next((str(one.message) for one in told if "truncated" in str(one.message)), None)
         if cut is not None:
@@ -69,15 +72,15 @@ def _check_tables(file: fits.HDUList) -> None:
             raise ValueError(f"TFIELDS: expected 0 to {MOST_COLUMNS} columns, got {n!r:.60}")
 
 
-def _recording(path: Path, file: fits.HDUList) -> Recording:
-    index = _image_index(file)
-    hdu = file[index]
-    _check_complete(path, hdu)
-    *frames, rows, columns = hdu.shape
-    for one in (file[0].header, hdu.header):
+def _recording(path: Path, file: fits.HDUList, hdu: int | str | None) -> Recording:
+    index = _image_index(file, hdu)
+    image = file[index]
+    _check_complete(path, image)
+    *frames, rows, columns = image.shape
+    for one in (file[0].header, image.header):
         check_exposures(one)
     header = file[0].header.copy()
-    header.update(hdu.header)
+    header.update(image.header)
     shape = (frames[0] if frames else 1, (rows, columns))
     counts = lazy_frames(path, partial(_read_frame, hdu=index), *shape, _dtype(header))
     return Recording(path=path, counts=counts, **described(header, (rows, columns)))
@@ -89,12 +92,20 @@ def _read_frame(path: Path, index: int, *, hdu: int) -> np.ndarray:
         return np.asarray(section[index, :, :] if len(section.shape) == 3 else section[:, :])
 
 
-def _image_index(file: fits.HDUList) -> int:
-    images = [i for i, hdu in enumerate(file) if hasattr(hdu, "section") and hdu.shape]
-    if len(images) != 1 or len(file[images[0]].shape) not in (2, 3):
-        shapes = [file[i].shape for i in images]
-        raise ValueError(f"expected one image [row, column] or [frame, row, column], got {shapes or 'none'}")
-    return images[0]
+def _image_index(file: fits.HDUList, hdu: int | str | None) -> int:
+    images = [i for i, one in enumerate(file) if hasattr(one, "section") and one.shape]
+    wanted = images if hdu is None else [i for i in images if hdu == i or _same_name(hdu, file[i].name)]
+    if len(wanted) == 1 and len(file[wanted[0]].shape) in (2, 3):
+        return wanted[0]
+    got = ", ".join(f"{i} {file[i].name} {file[i].shape}".replace("  ", " ") for i in images) or "none"
+    if hdu is not None:
+        raise ValueError(f"{setting('hdu', hdu)}: expected one of the images (number, name, shape): {got}")
+    which = f"; {setting('hdu')} takes one of several, such as an amplifier's" if len(images) > 1 else ""
+    raise ValueError(f"expected one image [row, column] or [frame, row, column], got {got}{which}")
+
+
+def _same_name(hdu: int | str, name: str) -> bool:
+    return isinstance(hdu, str) and hdu.strip().upper() == name.strip().upper() != ""
 
 
 def _check_complete(path: Path, hdu: Any) -> None:

@@ -13,7 +13,7 @@ from hsnoise.frames.bayer import shift_cfa
 from hsnoise.frames.io._kinds import kind_of
 from hsnoise.frames.io._recording import UNKNOWN_ORDER
 
-EXPOSURE = ("EXPTIME", "EXPOSURE", "EXP_TIME", "EXP-TIME", "EXPOSED", "ITIME")
+EXPOSURE = ("EXPTIME", "EXPOSURE", "EXP_TIME", "EXP-TIME", "EXPOSED", "ITIME", "IMG_EXP", "ELAPTIME", "INTTIME")
 KIND = ("IMAGETYP", "IMAGETYPE", "FRAME", "OBSTYPE", "IMTYPE", "IMGTYPE")
 TEMPERATURE = ("CCD-TEMP", "CCDTEMP", "CCD_TEMP", "DET-TEMP", "DETTEMP", "SENSTEMP", "SET-TEMP")
 GAIN = ("GAIN", "CCDGAIN", "GAINRAW")
@@ -24,19 +24,24 @@ UNITS_S = {  # in comments of exposures
     r"\b([uµ]s|usecs?|micro-?sec\w*)\b": 1e-6,
     r"\bminutes?\b": 60.0,
 }
+LAMPS = re.compile(r"\b(arcs?|lamps?|comp|comparison)\b", re.IGNORECASE)  # in names of objects: spectra of lamps
+HOTTEST_C = 100.0  # no sensor is hotter: more are kelvins
+KELVIN = re.compile(r"\bkelvins?\b|\bK\b")
 LEAST_E, MOST_E = 0.1, 10.0  # range in which a number without a unit may be electrons per DN
 ELECTRONS_PER_DN = re.compile(r"\be(lectrons?)?-?\s*(/|per)\s*(adu|dn|count)", re.IGNORECASE)
 
 
 def described(header: fits.Header, size: tuple[int, int]) -> dict[str, Any]:
     """Fields of a `Recording` with frames of `size` (rows, columns)."""
-    kind = kind_of(_text(header, KIND))
+    kind, target = kind_of(_text(header, KIND)), _text(header, ("OBJECT",))
+    if kind is None:
+        kind = kind_of(target, calibration_only=True) or ("light" if LAMPS.search(target or "") else None)
     exposure_s = _exposure_s(header)
     return {
         "exposure_s": exposure_s,
-        "kind": kind_of(_text(header, ("OBJECT",)), calibration_only=True) if kind is None else kind,
+        "kind": kind,
         "cfa": _cfa(header),
-        "temperature_c": _number(header, TEMPERATURE),
+        "temperature_c": _temperature_c(header),
         "is_open": header["SHUTTER"] if isinstance(header.get("SHUTTER"), bool) else None,
         "binning": _binning(header),
         "gain_setting": _number(header, GAIN),
@@ -63,6 +68,16 @@ def _exposure_s(header: fits.Header) -> float | None:
         if value is not None:
             comment = header.comments[name]
             return value * next((factor for unit, factor in UNITS_S.items() if re.search(unit, comment, re.I)), 1.0)
+    return None
+
+
+def _temperature_c(header: fits.Header) -> float | None:
+    """The sensor's temperature, degrees C; of cold sensors headers give kelvins, often without saying so."""
+    for name in TEMPERATURE:
+        value = _number(header, (name,))
+        if value is not None:
+            is_kelvin = value > HOTTEST_C or (value > 0 and KELVIN.search(header.comments[name]) is not None)
+            return value - 273.15 if is_kelvin else value
     return None
 
 

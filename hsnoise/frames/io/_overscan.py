@@ -16,7 +16,8 @@ from hsnoise.frames.stack import FrameStack
 
 LEAST, MOST = 3, 128  # columns of an overscan
 WIDEST = 0.25  # of the frame: a wider strip is not an edge
-UNLIT, LIT = 0.3, 0.7  # of the median signal
+UNLIT, LIT = 0.3, 0.7  # of the signal beside it
+LEAST_LIGHT, BESIDE = 0.3, 32  # of the median signal beside an overscan, in so many lines
 BLURRED = 3  # columns at most between unlit and lit: vignetting is more gradual
 LEAST_SIGNAL_DN = 10.0
 SOME_FRAMES = 3  # of a group, from which the mean of its overscan is taken
@@ -99,7 +100,11 @@ def find(stack: FrameStack) -> list[Strip]:
 
 def _dark_end(profile: np.ndarray) -> int:
     """The number of dark values at the start, if the step to lit values is sharp; otherwise 0."""
-    unlit, lit = np.abs(profile) < UNLIT, profile > LIT
+    first_lit = int(np.argmax(profile > UNLIT * LEAST_LIGHT))  # the level of an overscan may fall with the light
+    beside = float(np.median(profile[first_lit : first_lit + BESIDE]))  # light may fall toward the edge
+    if beside < LEAST_LIGHT:
+        return 0
+    unlit, lit = np.abs(profile) < UNLIT * beside, profile > LIT * beside
     if unlit.all() or not lit.any():
         return 0
     n, until = int(np.argmin(unlit)), int(np.argmax(lit))

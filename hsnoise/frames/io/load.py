@@ -23,6 +23,7 @@ def load(
     row_axis: int = 0,
     roi: tuple[Any, Any] | None = None,
     overscan: str | tuple[Any, Any] | None = None,
+    hdu: int | str | None = None,
     progress: bool = True,
 ) -> FrameStack:
     """Read a capture: dark frames, flat frames or both, of one camera at one gain setting.
@@ -52,10 +53,13 @@ def load(
         overscan: "auto" removes rows or columns at the edges that do not follow the light of flats, or that the
             headers name, and keeps their means in `overscan_dn`. ((first row, end row), (first column, end column)),
             one of them None, removes these. None only names what is found.
+        hdu: which image of FITS files with several, such as those of the amplifiers of one sensor: its number in the
+            file (0 is the primary one) or its EXTNAME.
         progress: show a bar on long reads.
 
     Raises:
         FileNotFoundError: no such file.
+        TypeError: `hdu` is neither a number nor a name.
         ValueError: an unreadable file, no exposure time, or frames that do not belong together without a majority;
             the message names the file. Also all errors of `FrameStack`.
     """
@@ -63,12 +67,15 @@ def load(
         one_of("cfa", cfa, ("mono", *BAYER_CFAS))
     if shutter is not None:
         one_of("shutter", shutter, SHUTTERS)
+    if hdu is not None and (isinstance(hdu, bool) or not isinstance(hdu, int | str)):
+        raise TypeError(f"hdu: expected the number or the name of an HDU, got {hdu!r:.60}.")
     options = {"cfa": cfa, "black_level": black_level, "white_level": white_level, "shutter": shutter}
     return read_capture(
         path,
         exposure_s=exposure_s,
         kind=kind,
         overscan=overscan,
+        hdu=hdu,
         progress=progress,
         roi=roi,
         row_axis=one_of("row_axis", row_axis, (0, 1)),

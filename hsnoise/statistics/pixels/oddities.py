@@ -19,11 +19,30 @@ LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # relative, of that signal over pixels:
 SMOOTHED = 0.1  # share of the noise that neighbouring pixels have in common
 LIT = 1.0  # in units of a pixel's noise: a larger shift of a frame is not a wandering black level
 FEWEST = 3  # frames among which an odd one can be found
+TWO_DN, TWO_SHARE = (
+    50.0,
+    0.5,
+)  # gap between two kinds of frames, in DN and of the lower level: no black level jumps so far
+WITHIN = 0.2  # of the gap: how much frames of a kind may differ
 
 
 def oddities_of(found: Survey) -> tuple[str, ...]:
     """What is wrong with frames, rows, columns and colours, most important first."""
     return (*_lit_frames(found), *_averages(found), *_lines(found), *_colours(found))
+
+
+def brighter_kind(levels_dn: np.ndarray) -> np.ndarray | None:
+    """Which frames [frame] are of the brighter of two kinds, of two frames or more each; None of one kind."""
+    ranked = np.sort(levels_dn)
+    if len(ranked) < 4:
+        return None
+    gaps = np.diff(ranked)
+    k = int(gaps.argmax()) + 1
+    gap, kinds = float(gaps[k - 1]), (ranked[:k], ranked[k:])
+    apart = gap > max(TWO_DN, TWO_SHARE * abs(float(ranked[0])))
+    if not apart or min(map(len, kinds)) < 2 or max(float(np.ptp(of)) for of in kinds) > WITHIN * gap:
+        return None
+    return levels_dn > ranked[k - 1]
 
 
 def name_of(group: Group) -> str:
@@ -35,6 +54,15 @@ def _called(group: Group, f: int) -> str:
 
 
 def _lit_frames(found: Survey) -> Iterator[str]:
+    for group in found.darks:
+        levels = np.mean([plane.frame_means_dn for plane in group.planes], axis=0)
+        if (above := brighter_kind(levels)) is not None:
+            off_dn = levels[above].mean() - levels[~above].mean()
+            yield (
+                f"{_called(group, int(above.argmax()))} and {int(above.sum()) - 1} more of {len(above)} are"
+                f" {off_dn:.4g} DN brighter than the others: are they lit, or taken at another exposure or temperature?"
+                " Fit one kind at a time, and give flats as such."
+            )
     for group, f, off in _odd_levels(found):
         if abs(off) > LIT * group.noise_dn:
             yield (

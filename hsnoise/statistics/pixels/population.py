@@ -32,6 +32,7 @@ MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and the logit that s
 HOT_FROM = 2.0  # mean extra of hot pixels, over the mean of the others
 MOST_COLD = 0.5  # of the number of warm pixels
 WARM_SIGMAS = 6.0  # in units of the noise of the levels, from those below the median
+MANY_ROWS = 48  # whose median tells what a column has
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
 
@@ -130,9 +131,13 @@ def warm_of(halves: np.ndarray, columns: int) -> Warm | None:
     """The warm pixels of one exposure; None where there are none.
 
     halves [half, pixel]: levels of pixels in rows of `columns`. What neighbours share, such as shading, is not an extra
-    level. Without a second exposure, charge of the exposure cannot be distinguished from charge of the readout.
+    level, nor what a whole column has: the first ones that an output reads may lie far off. Without a second exposure,
+    charge of the exposure cannot be distinguished from charge of the readout.
     """
     off = np.stack([half - of_neighbours(half, columns) for half in halves]).astype(np.float64)
+    of_column = off.mean(0).reshape(-1, columns)
+    if len(of_column) >= MANY_ROWS:
+        off -= np.tile(np.median(of_column, axis=0), len(of_column))
     extra = off.mean(0) - np.median(off.mean(0))
     noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):

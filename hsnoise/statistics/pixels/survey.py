@@ -37,6 +37,7 @@ class Plane:
     exceeds the error for independent rows: slow noise, bands, and noise that is stronger in some frames.
     banding: by axis, a sinusoid over rows or columns that moves from frame to frame; of mono frames alone, as lines of
     every second row do not tell its frequency.
+    single_dn: sampled pixels of an exposure of one frame [pixel], DN; None of several.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
     """
@@ -50,6 +51,7 @@ class Plane:
     rows_error_dn2: float
     banding: dict[str, Banding]
     halves: Halves | None
+    single_dn: np.ndarray | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
 
@@ -290,6 +292,7 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plan
         rows_error_dn2=max(components["row_x_frame"].standard_error_dn2, _by_frames(row_frame)),
         banding={} if step > 1 else _banding(row_frame, column_frame),
         halves=halves,
+        single_dn=counts[0].ravel().astype(np.float32) if n == 1 else None,
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )

@@ -20,6 +20,7 @@ MOST = 0.6  # share of the new seams of a layout that must be there
 LEAST, LEAST_NOISE = 1e-4, 3e-3  # of the noise's variance, of the noise: differences that change no frame visibly
 PIECES = 8  # of a row, in all of which even columns lie on one side of odd ones
 GAINS_APART = 5.0  # standard errors of the spread of gains
+LEAST_LIT = 0.2  # of the signal of the typical pixel
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
 
 Bounds = list[slice]
@@ -110,15 +111,28 @@ def _level_and_noise(group: Group) -> tuple[np.ndarray, np.ndarray]:
 
 
 def levelled(found: Survey, taps: Taps) -> Survey:
-    """The survey with the offsets of outputs subtracted from the static rows and columns of its shortest darks."""
-    shortest = found.shortest
-    groups = [
-        replace(g, planes=tuple(_levelled(p, taps) for p in g.planes)) if g is shortest else g for g in found.groups
-    ]
+    """The survey with the offsets of outputs subtracted from all pixels, and from lines of its shortest darks."""
+    bounds = _bounds_of(found, taps)
+    shift = np.zeros((found.sampled_rows.size // _step(found), found.shape[1] // _step(found)), np.float32)
+    for rows, of_row in zip(bounds[0], taps.offset_dn, strict=True):
+        for columns, offset in zip(bounds[1], of_row, strict=True):
+            shift[rows, columns] = offset
+    groups = []
+    for group in found.groups:
+        planes = [_pixels_levelled(plane, shift.ravel()) for plane in group.planes]
+        if group is found.shortest:
+            planes = [_lines_levelled(plane, taps) for plane in planes]
+        groups.append(replace(group, planes=tuple(planes)))
     return replace(found, groups=tuple(groups))
 
 
-def _levelled(plane: Plane, taps: Taps) -> Plane:
+def _pixels_levelled(plane: Plane, shift: np.ndarray) -> Plane:
+    if plane.halves is None:
+        return replace(plane, single_dn=plane.single_dn - shift)
+    return replace(plane, halves=replace(plane.halves, level_dn=plane.halves.level_dn - shift))
+
+
+def _lines_levelled(plane: Plane, taps: Taps) -> Plane:
     means, components = {}, dict(plane.components)
     for axis in ("row", "column"):
         before = getattr(plane, f"{axis}_mean_dn")
@@ -140,10 +154,20 @@ def _map(group: Group, name: str) -> np.ndarray:
 
 def _bounds(found: Survey, axis: int, count: int) -> Bounds:
     """First and last line of each block among the sampled lines of a plane."""
-    step = 1 if found.cfa == "mono" else 2
+    step = _step(found)
     lines = found.sampled_rows[::step] if axis == 0 else np.arange(0, found.shape[1], step)
     edges = np.searchsorted(lines, [of * found.shape[axis] / count for of in range(count + 1)])
     return [slice(start, stop) for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+
+
+def _bounds_of(found: Survey, taps: Taps) -> list[Bounds]:
+    rows = _bounds(found, 0, taps.rows)
+    return [rows, EVEN_AND_ODD if taps.interleaved else _bounds(found, 1, taps.columns)]
+
+
+def _step(found: Survey) -> int:
+    """Lines of the sensor for one of a plane."""
+    return 1 if found.cfa == "mono" else 2
 
 
 def _alternates(values: np.ndarray) -> bool:
@@ -193,25 +217,45 @@ def _is_seam(profile: np.ndarray, edge: int, edges: Iterable[int]) -> bool:
 def _gains(found: Survey, bounds: Sequence[Bounds], at_rest: Moments) -> tuple[np.ndarray, np.ndarray]:
     """Gains of blocks relative to their mean, by the variance that signal adds, and errors; weighted means.
 
+    Light need not be even within a block: each pixel's variance is taken over the one that its own signal lets expect.
+
     at_rest: moments of the blocks in the shortest darks.
     """
     ratios, errors = [], []
-    level, variance, chance = at_rest
+    level, rest, chance = at_rest
+    dark = None if found.shortest is None else _map(found.shortest, "level_dn")
     for group in found.groups:
         if group.n_frames < 2 or group is found.shortest:
             continue
-        brighter, noisier, of_it = _moments(group, bounds)
-        signal, added = brighter - level, noisier - variance
-        if (signal <= 0).any() or brighter.max() > FILLED * found.full_scale_dn:
+        brighter, noisier, _ = _moments(group, bounds)
+        if (brighter <= level).any() or brighter.max() > FILLED * found.full_scale_dn:
             continue
-        if added.mean() > LEAST_SIGNAL * variance.mean():
-            mean = float(np.mean(added / signal))
-            ratios.append(added / signal / mean)
-            errors.append(np.hypot(of_it, chance) / signal / mean)
+        if (noisier - rest).mean() > LEAST_SIGNAL * rest.mean():
+            signal, variance = _map(group, "level_dn") - dark, _map(group, "pair_variance_dn2")
+            mean = float(np.mean((noisier - rest) / (brighter - level)))
+            of = [
+                [
+                    _against(signal[rows, columns], variance[rows, columns], mean, at, group.n_frames)
+                    for columns, at in zip(bounds[1], of_row, strict=True)
+                ]
+                for rows, of_row in zip(bounds[0], rest, strict=True)
+            ]
+            ratio, error = np.moveaxis(np.array(of), 2, 0)
+            ratios.append(ratio / ratio.mean())
+            errors.append(np.hypot(error, chance / (mean * (brighter - level))))
     if not ratios:
         return np.full_like(level, np.nan), np.full_like(level, np.nan)
     weight = np.array(errors) ** -2.0
     return (weight * ratios).sum(0) / weight.sum(0), weight.sum(0) ** -0.5
+
+
+def _against(signal: np.ndarray, variance: np.ndarray, gain: float, rest: float, frames: int) -> tuple[float, float]:
+    """Gain of the pixels of a block over `gain`, and its error; `rest`: their variance without signal, DN^2."""
+    lit = signal > LEAST_LIT * float(np.median(signal))  # covered pixels tell nothing of gains
+    expected = rest + gain * np.maximum(signal[lit], 0.0)
+    ratio, error = without_outliers(variance[lit] / expected, frames)
+    share = float(np.mean(gain * signal[lit] / expected))
+    return 1 + (ratio - 1) / share, error / share
 
 
 def _moments(group: Group, bounds: Sequence[Bounds]) -> Moments:
