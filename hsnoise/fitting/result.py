@@ -96,6 +96,7 @@ class FitResult:
         outliers: fraction of the pixels of each dark exposure that was excluded because no model fits it; or None.
         doubts: sentences on disagreements and withheld parameters, printed above the table.
         grave: whether a doubt says that a parameter may be wrong; other doubts report what was excluded.
+        grave_in_dn: likewise, but for a gain that is not determined: without one, noise in DN can still be right.
         withheld: names of parameters that the frames do not determine: NaN in `table`. `params` then has a gain of
             1 DN/e-, so its electrons are DN and darks are still drawn with the right noise.
         added: effects of `params` that the fit put in because the pixels differ.
@@ -116,6 +117,7 @@ class FitResult:
     outliers: np.ndarray | None = None
     doubts: tuple[str, ...] = ()
     grave: bool = False
+    grave_in_dn: bool = False
     withheld: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     transfer: Any = None
@@ -136,8 +138,8 @@ class FitResult:
         first = self.doubts[0]
         others = f" ({len(self.doubts) - 1} more below)" if len(self.doubts) > 1 else ""
         # That there is no gain is no error: noise in DN can be used.
-        if not self.has_gain and not others:
-            return Conclusion(Light.AMBER, "In DN only.", first)
+        if not self.has_gain and not self.grave_in_dn:
+            return Conclusion(Light.AMBER, "In DN only.", f"{first}{others}")
         if self.grave:
             return Conclusion(Light.RED, "Do not use these numbers.", f"{first}{others}")
         return Conclusion(Light.AMBER, "Usable, with doubts.", f"{first}{others}")

@@ -177,7 +177,7 @@ def test_fits_light_frames_need_a_kind(tmp_path):
 def test_fits_of_several_images(tmp_path):
     images = [fits.PrimaryHDU(dark_counts(4, 4)), fits.ImageHDU(dark_counts(4, 4))]
     fits.HDUList(images).writeto(tmp_path / "a.fits")
-    with pytest.raises(ValueError, match=r"a.fits: expected one image .* got \[\(4, 4\), \(4, 4\)\]"):
+    with pytest.raises(ValueError, match=r"a.fits: expected one image .* got 0 PRIMARY \(4, 4\), 1 \(4, 4\); hdu="):
         load(tmp_path)
 
 

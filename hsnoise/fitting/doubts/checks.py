@@ -2,8 +2,9 @@
 
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
 headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
-`_taps`: outputs with gains of their own. `_choice`: which of two fits to believe. Here: a gain without growth of signal
-to support it, frames and pixels that measure nothing, and the order of all checks.
+`_taps`: outputs with gains of their own. `_few`: what two or three frames leave open. `_choice`: which of two fits to
+believe. Here: a gain without growth of signal to support it, frames and pixels that measure nothing, and the order of
+all checks.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from hsnoise._core.types import seconds
 from hsnoise.fitting.doubts._choice import APART_SHARE, APART_SIGMAS, carries_no_gain, confirmed
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
+from hsnoise.fitting.doubts._few import few_frames, single_frames
 from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
@@ -50,9 +52,11 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
     coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _falling, _of_pooling)
-    checks = (_withheld, _single_frames, *coarse, *of_pixels, disagreements)
+    checks = (single_frames, *coarse, *of_pixels, disagreements)
+    open_gain = [*_withheld(result, found)]
     grave = [sentence for check in checks for sentence in check(result, found)]
-    grave += [*stated(result, seen), *oddities_of(found)]
+    odd = oddities_of(found)
+    grave += [*stated(result, seen), *odd]
     moved, shared = tuple(moved_frames(found)), of_the_signal(found.along)
     grave += moved if result.transfer is None else ()
     grave += () if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
@@ -77,11 +81,13 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_outliers(result),
         *_moved_pedestals(result),
         *_many_hot(result),
+        *few_frames(result, found),
         *curves(result),
         *gains_differ(result),
         *flat_doubts(result),
     )
-    doubts = tuple(dict.fromkeys([*grave, *minor]))
+    doubts = tuple(dict.fromkeys([*odd, *open_gain, *grave, *minor]))  # first what makes all others pointless
+    is_wrong = bool(grave) or share > MOST_OUTLIERS
     notes = result.notes
     if result.method == Method.TRANSFER:
         notes = (
@@ -95,7 +101,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
             *_of_flats(result),
         )
     notes = tuple(note for note in notes if note not in doubts)
-    return replace(result, doubts=doubts, grave=bool(grave) or share > MOST_OUTLIERS, notes=notes)
+    return replace(result, doubts=doubts, grave=is_wrong or bool(open_gain), grave_in_dn=is_wrong, notes=notes)
 
 
 def _without_open_gain(result: FitResult) -> FitResult:
@@ -206,16 +212,6 @@ def _flats_against_darks(pixel: PixelFit) -> Iterator[str]:
                 f"Flats give a gain of {flat:.4g} ± {error:.2g} DN/e-, darks {t.gain:.4g} ± {t.gain_error:.2g}: one of"
                 " them is wrong (another gain setting, a nonlinear response, moving pedestals)."
             )
-
-
-def _single_frames(result: FitResult, found: Survey) -> Iterator[str]:
-    """Darks without two frames at any exposure, which cannot show whether pixels differ."""
-    if found.darks and all(g.n_frames < 2 for g in found.darks):
-        yield (
-            "Each exposure has one dark frame, so differences between pixels cannot be distinguished from noise and"
-            " can make gain and read noise wrong by large factors. Take at least two frames of each exposure, better"
-            " eight."
-        )
 
 
 def _by_shape_alone(result: FitResult) -> Iterator[str]:
