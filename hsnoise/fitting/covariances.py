@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
+SURE = 1e-6  # of its standard error, by which a number varies that is held
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
 
 
@@ -21,6 +22,19 @@ def as_scattered(covariance: np.ndarray, gain: np.ndarray, prior: np.ndarray, z:
     estimates = z @ (covariance @ gain).T
     few = (special.stdtrit(n - 1, 0.975) / special.ndtri(0.975)) ** 2
     return estimates.T @ estimates * few * (1 + 1 / n) / (n - 1) + (covariance * prior) @ covariance
+
+
+def given(covariance: np.ndarray, held: list[int]) -> np.ndarray:
+    """`covariance` of the other numbers if those of `held` are what they are; theirs is hardly more than 0."""
+    conditional = covariance.copy()
+    others = [i for i in range(len(covariance)) if i not in held and np.isfinite(covariance[i, i])]
+    across = covariance[np.ix_(others, held)]
+    known = across @ np.linalg.solve(covariance[np.ix_(held, held)], across.T)
+    conditional[np.ix_(others, others)] -= known
+    least = SURE**2 * np.diagonal(covariance)[held]
+    conditional[held], conditional[:, held] = 0.0, 0.0
+    conditional[held, held] = least
+    return conditional
 
 
 def not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:

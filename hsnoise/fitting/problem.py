@@ -11,6 +11,7 @@ import numpy as np
 
 from hsnoise._core.naming import named
 from hsnoise.effects import Stage
+from hsnoise.fitting.covariances import SURE, given
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.coordinates import Coordinates, coordinates_for
@@ -26,7 +27,6 @@ PRIOR_SIGMA = 1.5  # of the logarithm of an effect's parameter: keeps what the d
 MOST_SPREAD = 0.25  # variance of base parameters, relative to their size, above which they are unknown
 LONGEST_STEP, LONGEST_OF_BASE = 1.5, 0.5  # in the logarithm of an effect's parameter; in sizes of a base parameter
 UNKNOWN = 100.0  # standard error, in sizes, of what the base fit does not know
-HELD = 1e-6  # of its standard error, by which a gain varies that is held
 ON_SIGNAL = (Stage.COUPLING, Stage.MULTIPLICATION, Stage.READOUT, Stage.GAIN)  # the photon transfer line shows it
 SCORE_ERROR = 0.3  # least error of the score in whitened units, whose deviation is 1 if the base fit is right
 
@@ -83,11 +83,19 @@ class Problem:
         """Whether the gain stays where pixels over time, or flats, have put it.
 
         Noise beside the signal does not bias it there. Statistics of all pixels would move it for whatever the model
-        still lacks.
+        still lacks. A gain that is not determined is 1, so that electrons are DN.
         """
         effects = [self.model[name] for name in self.extra]
         on_signal = any(one.acts_at in ON_SIGNAL or one.confounded_with == "gain" for one in effects)
-        return self.base.transfer is not None and self.base.has_gain and not on_signal
+        return self.base.transfer is not None and not (self.base.has_gain and on_signal)
+
+    @property
+    def of_base(self) -> np.ndarray:
+        """Covariance of the base fit, given the gain if that is not determined."""
+        base = self.base
+        if base.transfer is None or base.has_gain:
+            return base.covariance
+        return given(base.covariance, [base.names.index(name) for name in base.rows_of("gain") if name in base.names])
 
     def _base_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Covariance of the base fit in the order of the coordinates, and which of these it did not fit."""
@@ -95,11 +103,11 @@ class Problem:
         covariance = np.diag(np.full(len(names), np.inf))
         here = [i for i, name in enumerate(names) if name in fitted]
         there = [fitted.index(names[i]) for i in here]
-        covariance[np.ix_(here, here)] = self.base.covariance[np.ix_(there, there)]
-        if self.holds_gain:
+        covariance[np.ix_(here, here)] = self.of_base[np.ix_(there, there)]
+        if self.holds_gain and self.base.has_gain:
             gains = self.coordinates.where("gain")
-            covariance[gains] *= HELD
-            covariance[:, gains] *= HELD
+            covariance[gains] *= SURE
+            covariance[:, gains] *= SURE
         return covariance, ~np.isfinite(np.diagonal(covariance))
 
     @cached_property

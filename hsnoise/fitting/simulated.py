@@ -231,7 +231,7 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         outliers=None,
         names=(*base.names, *problem.added.names),
         withheld=withheld,
-        covariance=not_surer_than(base.covariance, _in_order(problem, turn @ covariance @ turn.T)),
+        covariance=not_surer_than(problem.of_base, _in_order(problem, turn @ covariance @ turn.T)),
         method=Method.SYNTHETIC,
         status=Status.MET if last_step < LONG_STEP else Status.NOT_MET,
         detail=f"the last step was {last_step:.1g} standard errors long{of_base}",
