@@ -11,6 +11,7 @@ from hsnoise.effects import (
     ADC,
     AmplifierGlow,
     BlackLevel,
+    ColumnNoise,
     DarkCurrent,
     DarkSignalNonuniformity,
     Gain,
@@ -59,3 +60,16 @@ def test_noise_that_is_alike_has_no_spread():
 def test_shot_noise_of_a_glow_is_no_read_noise():
     """Rows near the edge that glows have more noise, from more dark signal."""
     assert "read_noise_nonuniformity" not in fitted(DarkCurrent(50.0), AmplifierGlow(200.0, 0.3), exposure_s=1.0).added
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+def test_columns_that_resemble_their_neighbours(exponent):
+    fit = fitted(ColumnNoise(2.0, exponent))
+    value, error, _ = fit.table["column_noise.exponent"]
+    if exponent == 0:
+        assert value == 0 and error == 0
+    else:
+        assert abs(value - exponent) < max(4 * error, 0.3)
+    sigma, of_sigma, unit = fit.shown["column_noise.sigma"]
+    assert unit == "DN" and abs(sigma - 0.8) < 4 * of_sigma < 0.8
+    assert "black_shading" not in fit.added

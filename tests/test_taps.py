@@ -72,6 +72,29 @@ def test_uneven_light_is_no_gain(rng):
     assert abs(fit.table["gain"][0] - 1) < 4 * fit.table["gain"][1]
 
 
+@pytest.mark.parametrize("layout", [(1, 4), (2, 2)])
+def test_outputs_that_wander_from_frame_to_frame(layout):
+    """Each on its own; no row, column or frame noise is left of it, and none is seen where outputs keep still."""
+    wander, n = 4.0, 12
+    for sigma in (wander, 0.0):
+        rng = np.random.default_rng(7)
+        static = 500 + blocks(30 * rng.standard_normal(layout)) + rng.normal(0, 0.5, SHAPE)
+        moving = np.array([blocks(sigma * rng.standard_normal(layout)) for _ in range(n)])
+        counts = np.rint(static + moving + 8 * rng.standard_normal((n, *SHAPE))).astype(np.uint16)
+        flats = np.rint(static + rng.poisson(2000, (2, *SHAPE)) + 8 * rng.standard_normal((2, *SHAPE)))
+        stack = hsnoise.FrameStack([counts, flats.astype(np.uint16)], [0.0, 1.0], kind=["dark", "flat"])
+        fit = hsnoise.fit(stack)
+        taps = fit.params["tap_offsets"]
+        assert (taps.row_taps, taps.taps) == layout
+        if sigma == 0:
+            assert float(taps.frame_sigma) == 0 and "tap_offsets.frame_sigma" not in fit.names
+            continue
+        value, error, unit = fit.table["tap_offsets.frame_sigma"]
+        assert unit == "e-" and abs(value - wander) < 4 * error < 4.0
+        for name in ("row_noise", "column_noise", "frame_offset"):
+            assert name not in fit.added or fit.table[f"{name}.sigma"][0] < 0.4 * wander
+
+
 def test_single_darks_beside_repeated_ones_show_no_signal_that_is_not_there(rng):
     """Offsets of outputs lie far apart: half of the pixels above the gap, half below."""
     stack = camera(np.ones((2, 2)), [[-50, 180], [40, -170]], rng, exposures=(1.0, 12.0), light=(2000,), gain=1.0)

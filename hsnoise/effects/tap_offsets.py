@@ -17,10 +17,13 @@ from hsnoise.effects._taps import check_taps, tap_of
 class TapOffsets(AbstractEffect):
     """Each of `row_taps` x `taps` equal blocks has its own offset, Normal(0, sigma^2) in e-, the same in all frames.
 
+    That of each output may wander, too: Normal(0, frame_sigma^2) is added, new in each frame.
+
     Fast sensors read blocks of columns through separate outputs, large ones their halves or quarters, and offsets are
     only trimmed to some accuracy. The mean of so few offsets is not zero; a fit sees it as part of the black level.
 
-    In dark frames: panels with sharp edges, the same in all exposures.
+    In dark frames: panels with sharp edges, the same in all exposures. A fit measures frame_sigma of outputs that lie
+    side by side: what rows share would look like that of outputs one above the other.
 
     Attributes:
         taps, row_taps: number of outputs over the columns and over the rows; at least 2 in all.
@@ -37,14 +40,18 @@ class TapOffsets(AbstractEffect):
     taps: int = eqx.field(static=True, default=4)
     after_gain: bool = eqx.field(static=True, default=False)
     row_taps: int = eqx.field(static=True, default=1)
+    frame_sigma: Scalar = param(
+        "e-", low=0, default=0.0, held="at bounds", doc="the same from frame to frame; simulated fits hold 0"
+    )
 
     def __check_init__(self):
         check_taps(self.name, self.taps, self.row_taps)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        offsets = jax.random.normal(capture.fixed_key(self.name), (self.row_taps * self.taps,), signal.dtype)
-        of_pixels = offsets[tap_of(capture, self.taps, self.row_taps)][None]
-        return signal + capture.offset(self.sigma * of_pixels, self.after_gain)
+        outputs, tap = self.row_taps * self.taps, tap_of(capture, self.taps, self.row_taps)
+        fixed = jax.random.normal(capture.fixed_key(self.name), (outputs,), signal.dtype)[tap][None]
+        moving = jax.random.normal(key, (len(signal), outputs), signal.dtype)[:, tap]
+        return signal + capture.offset(self.sigma * fixed + self.frame_sigma * moving, self.after_gain)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:

@@ -21,10 +21,18 @@ from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_un
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_offsets import offset_of, pattern_of
 from hsnoise.fitting.pixel_outputs import outputs_by_light
-from hsnoise.fitting.pixel_patterns import banding_in, known_of_rows, lines_in, patterns_of, shadings_of, shortest_of
+from hsnoise.fitting.pixel_patterns import (
+    banding_in,
+    known_of_columns,
+    known_of_rows,
+    lines_in,
+    patterns_of,
+    shadings_of,
+    shortest_of,
+)
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
 from hsnoise.fitting.pixel_response import STRAIGHT, Bend, bend_of
-from hsnoise.fitting.pixel_rows import RowSpectrum, row_gain_of_darks, row_spectrum
+from hsnoise.fitting.pixel_rows import RowSpectrum, column_spectrum, row_gain_of_darks, row_spectrum
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
@@ -70,7 +78,7 @@ class Channel:
         temporal_dn2: variance of the pixels themselves.
         is_narrow: whether that noise is narrower than a count: rounding hides differences of pixels then.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
-        row_spectrum: of what rows share in a frame.
+        row_spectrum, column_spectrum: of what rows and columns share in a frame.
         noise_spread: of the logarithm of read noise over pixels, rows and columns.
         bend: of the response, from flats.
         photo_response: how pixels, rows and columns differ in their response to light (PRNU).
@@ -98,6 +106,7 @@ class Channel:
     is_narrow: bool
     shading: Mapping[str, Shading]
     row_spectrum: RowSpectrum
+    column_spectrum: RowSpectrum
     noise_spread: NoiseSpread
     bend: Bend
     photo_response: Responses
@@ -172,6 +181,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
     floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
     pixels = levels_of(found, c, without=jumping) if is_plain else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
+    of_columns = column_spectrum(shortest_of(found, c), found.shape[1], known_of_columns(found, c))
     banding = banding_in(found, c)
     row_gain = partial(row_gain_of_darks, found, c, spectrum, banding)
     rays = _rays(found, c) if is_plain else None
@@ -198,7 +208,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
-    shading = shadings_of(found, c, spectrum.widened)
+    shading = shadings_of(found, c, (spectrum.widened, of_columns.widened))
     lines = lines_in(found, c, shading)
     offset = offset_of(found, c, population)
     warm = _warm(found, c) if is_plain and not found.has_exposures else None
@@ -224,6 +234,7 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
         is_narrow=narrow is not None,
         shading=shading,
         row_spectrum=spectrum,
+        column_spectrum=of_columns,
         noise_spread=_noise_spread(found, c, float(values[1]), jumps, tail) if is_plain else UNKNOWN_SPREAD,
         bend=(bend := STRAIGHT if flats is None else bend_of(found, flats, c)),
         photo_response=photo_response(found, c, black[0], offset[0], flats, bend),

@@ -51,10 +51,16 @@ def known_of_rows(found: Survey, c: int, apart: int = 0) -> float:
     return of_wave + (0.0 if groups is None else groups.of_rows_dn2(apart, mono=found.cfa == "mono"))
 
 
-def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shading]:
+def known_of_columns(found: Survey, c: int) -> float:
+    """Variance of columns over frames that a sinusoid makes at the shortest exposure, DN^2."""
+    wave = _wave_of(found, c, "column")
+    return 0.0 if wave is None else wave.variance_dn2
+
+
+def shadings_of(found: Survey, c: int, widened: tuple[float, float] = (1.0, 1.0)) -> dict[str, Shading]:
     """The drift of the black level along the rows or down the frame: a model has one.
 
-    widened: as in `RowSpectrum`; slow row noise drifts, too, and a few frames do not average it out.
+    widened: as in `RowSpectrum`, of rows and of columns; slow noise drifts, too, and few frames do not average it out.
     """
     planes, out = shortest_of(found, c), {}
     for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
@@ -63,7 +69,7 @@ def shadings_of(found: Survey, c: int, widened: float = 1.0) -> dict[str, Shadin
             means = np.mean([getattr(p, name) for p in planes], axis=0)
             of_lines_dn2 = mean_of([p.components[f"{axis}_x_frame"] for p in planes]).variance_dn2
             # In the shape of a shading: all of it, if a few slow waves make the noise.
-            slow = min(2 * (widened if axis == "row" else 1.0) ** 2 / len(means), 1.0)
+            slow = min(2 * widened[AXES.index(axis)] ** 2 / len(means), 1.0)
             chance = np.sqrt(max(of_lines_dn2, 0.0) / found.shortest.n_frames * slow)
             one = shading_of(means, float(noise), float(chance))
             out |= {} if one is None else {axis: one}
@@ -93,7 +99,7 @@ def patterns_of(
         return out
     waves = {axis: _wave_of(found, c, axis) for axis in ("row", "column")}
     known = {"row_x_frame": known_of_rows(found, c)}
-    known |= {} if waves["column"] is None else {"column_x_frame": waves["column"].variance_dn2}
+    known["column_x_frame"] = known_of_columns(found, c)
     scatter = {}
     if (groups := found.row_groups) is not None:
         mono, frames = found.cfa == "mono", found.shortest.n_frames

@@ -190,12 +190,15 @@ def _population(
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
     found |= _waves_and_groups(pixel, gain)
-    exponents = [c.row_spectrum.exponent for c in pixel.channels]
-    if "row_noise" in found:
-        sigma, error = found["row_noise"]["sigma"]
-        found["row_noise"]["sigma"] = sigma, error * max(c.row_spectrum.widened for c in pixel.channels)
-        if all(value != 0 for value, _ in exponents):
-            found["row_noise"]["exponent"] = of_colours(exponents)
+    for name, spectra in (
+        ("row_noise", [c.row_spectrum for c in pixel.channels]),
+        ("column_noise", [c.column_spectrum for c in pixel.channels]),
+    ):
+        if name in found:
+            sigma, error = found[name]["sigma"]
+            found[name]["sigma"] = sigma, error * max(one.widened for one in spectra)
+            if all(one.exponent[0] != 0 for one in spectra):
+                found[name]["exponent"] = of_colours([one.exponent for one in spectra])
     for axis in AXES:
         of_lines = [c.lines[axis].exponent for c in pixel.channels if axis in c.lines]
         if PATTERNS[axis] in found and all(value != 0 for value, _ in of_lines):

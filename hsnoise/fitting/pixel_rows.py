@@ -49,13 +49,8 @@ def row_spectrum(
     """
     if not planes:
         return WHITE
-    alone = mean_of([p.components["row_x_frame"] for p in planes])
-    near, but_one = (mean_of([p.rows_together[lag] for p in planes]) for lag in (0, 1))
     step = rows // len(planes[0].row_mean_dn)
-    alone, near, but_one = (
-        replace(one, variance_dn2=one.variance_dn2 - known_dn2(lag * step))
-        for lag, one in enumerate((alone, near, but_one))
-    )
+    alone, near, but_one = _covariances(planes, "row", step, known_dn2)
     if alone.variance_dn2 <= 0:
         return WHITE
     combed = (but_one.variance_dn2 - near.variance_dn2) / np.hypot(but_one.chance_dn2, near.chance_dn2)
@@ -67,6 +62,27 @@ def row_spectrum(
     exponent = _exponent(near, alone, rows, step)
     power = fading_power(rows, np.float32(exponent[0])) if banks is None else _power_of(banks, rows)
     return RowSpectrum(exponent, banks, widened(np.array(power, float)))
+
+
+def column_spectrum(planes: Sequence[Plane], columns: int, known_dn2: float) -> RowSpectrum:
+    """Likewise of what columns share in a frame; known_dn2: their variance by other effects."""
+    if not planes:
+        return WHITE
+    step = columns // len(planes[0].column_mean_dn)
+    alone, near, _ = _covariances(planes, "column", step, lambda apart: known_dn2)
+    if alone.variance_dn2 <= TOGETHER * alone.chance_dn2:
+        return WHITE
+    exponent = _exponent(near, alone, columns, step)
+    return RowSpectrum(exponent, None, widened(np.array(fading_power(columns, np.float32(exponent[0])), float)))
+
+
+def _covariances(
+    planes: Sequence[Plane], axis: str, step: int, known_dn2: Callable[[int], float]
+) -> tuple[Component, ...]:
+    """Variance of lines over frames, and covariance of neighbours and of the next but one, without what is known."""
+    parts = [(p.components[f"{axis}_x_frame"], *getattr(p, f"{axis}s_together")) for p in planes]
+    means = [mean_of(list(of)) for of in zip(*parts, strict=True)]
+    return tuple(replace(one, variance_dn2=one.variance_dn2 - known_dn2(lag * step)) for lag, one in enumerate(means))
 
 
 def _exponent(near: Component, alone: Component, rows: int, step: int) -> Number:

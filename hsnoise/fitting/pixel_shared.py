@@ -77,6 +77,9 @@ def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]
     few = np.sqrt(2 * (taps.offset_dn.size - 1))
     sigma, (spread, error) = float(taps.offset_dn.std(ddof=1)) / gain, taps.gain_spread
     found = {"tap_offsets": {"sigma": (sigma, sigma / few)}}
+    if taps.change_dn is not None:
+        wander, of_wander = taps.wander_dn
+        found["tap_offsets"]["frame_sigma"] = wander / gain, of_wander / gain
     if taps.gains_differ:
         found["tap_gains"] = {"spread": (spread, float(np.hypot(spread / few, error)))}
     return found

@@ -23,7 +23,7 @@ def bias_frames(seed: int) -> hsnoise.FrameStack:
 
 
 def test_what_bias_frames_know_keeps_its_digits_beside_what_they_do_not():
-    """The read noise in DN is known to a part in a thousand, row gain not at all; the gain is held, so that e- are DN."""
+    """Read noise in DN is known to a part in a thousand, row gain not at all; the gain is held: electrons are DN."""
     stack = bias_frames(0)
     base = hsnoise.fit(stack)
     problem = Problem(Portion.of(stack), base, base.params, (), base.params)

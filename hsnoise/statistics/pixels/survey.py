@@ -25,6 +25,7 @@ from hsnoise.statistics.pixels.waves import MOST_FRAMES, Spectrum, Wave, middle_
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
 MOST_CODES = 100_000  # counts of a frame that tell the step of its codes
+COLUMN_BLOCKS = 16  # the most outputs side by side that are looked for
 NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN^2
 
 
@@ -32,12 +33,14 @@ NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN
 class Plane:
     """One colour plane of one exposure: its channel, means, components, and sampled pixels.
 
-    rows_together: covariance of a row with the next, and with the next but one, in a frame.
+    rows_together, columns_together: covariance of a line with the next, and with the next but one, in a frame.
     rows_error_dn2: standard error of the variance of rows over frames by how it differs from frame to frame, where that
     exceeds the error for independent rows: slow noise, bands, and noise that is stronger in some frames.
     banding: by axis, a sinusoid over rows or columns that moves from frame to frame; of mono frames alone, as lines of
     every second row do not tell its frequency.
     single_dn: sampled pixels of an exposure of one frame [pixel], DN; None of several.
+    blocks_dn: mean change of blocks of the frame [frame, half of the rows, sixteenth of the columns] from the mean of
+        the frames, DN; of the shortest repeated darks alone.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
     """
@@ -48,10 +51,12 @@ class Plane:
     frame_means_dn: np.ndarray
     components: dict[str, Component]
     rows_together: tuple[Component, Component]
+    columns_together: tuple[Component, Component]
     rows_error_dn2: float
     banding: dict[str, Banding]
     halves: Halves | None
     single_dn: np.ndarray | None
+    blocks_dn: np.ndarray | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
 
@@ -258,8 +263,10 @@ def _group(
         highest = max(highest, int(frame.max()))
         tick()
     assert kept is not None and odd is not None  # FrameStack has no empty groups
+    half = int(np.searchsorted(rows[::step], stack.shape[0] / 2)) if looks_for_row_groups else None
     planes = tuple(
-        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step) for p in range(step**2)
+        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
+        for p in range(step**2)
     )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
@@ -277,7 +284,8 @@ def _group(
     return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest, of_codes
 
 
-def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plane:
+def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int, half: int | None) -> Plane:
+    """half: sampled rows of the plane in the first half of the frame; None where blocks are not looked at."""
     n, (h, w) = sums.n_frames, sums.shape
     halves = halves_of(counts) if n > 1 else None
     row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
@@ -289,13 +297,33 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int) -> Plan
         frame_means_dn=sums.frame_means_dn,
         components=components,
         rows_together=(of_neighbouring_rows(row_frame), of_neighbouring_rows(row_frame, 2)),
+        columns_together=(of_neighbouring_rows(column_frame), of_neighbouring_rows(column_frame, 2)),
         rows_error_dn2=max(components["row_x_frame"].standard_error_dn2, _by_frames(row_frame)),
         banding={} if step > 1 else _banding(row_frame, column_frame),
         halves=halves,
         single_dn=counts[0].ravel().astype(np.float32) if n == 1 else None,
+        blocks_dn=None if half is None or n == 1 else _blocks(counts, half),
         neighbours_share=_neighbours_share(counts),
         narrow_dn=_narrow(counts, halves),
     )
+
+
+def _blocks(counts: np.ndarray, half: int) -> np.ndarray | None:
+    """Mean change of blocks of each frame [frame, half of the rows, sixteenth of the columns], outliers cut, DN."""
+    _, rows, columns = counts.shape
+    edges = [columns * of // COLUMN_BLOCKS for of in range(COLUMN_BLOCKS)]
+    if not 0 < half < rows or columns < COLUMN_BLOCKS:
+        return None
+    mean, blocks = counts.mean(0, dtype=np.float32), []
+    for frame in counts:
+        change = frame - mean
+        middle = float(np.median(change))
+        width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change - middle)))
+        cut = np.clip(change, middle - width, middle + width)
+        of_columns = np.stack([part.mean(0) for part in np.split(cut, [half])])
+        sizes = np.diff([*edges, columns])
+        blocks.append(np.add.reduceat(of_columns, edges, axis=1) / sizes)
+    return np.stack(blocks)
 
 
 def _by_frames(row_frame: np.ndarray) -> float:

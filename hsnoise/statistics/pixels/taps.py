@@ -19,6 +19,7 @@ FEWEST_PLACES = 24  # elsewhere, which tell the typical difference
 MOST = 0.6  # share of the new seams of a layout that must be there
 LEAST, LEAST_NOISE = 1e-4, 3e-3  # of the noise's variance, of the noise: differences that change no frame visibly
 PIECES = 8  # of a row, in all of which even columns lie on one side of odd ones
+WANDERS = 25.0  # times the variance by chance, beyond which outputs wander from frame to frame
 GAINS_APART = 5.0  # standard errors of the spread of gains
 LEAST_LIT = 0.2  # of the signal of the typical pixel
 LEAST_SIGNAL = 0.2  # of the variance without signal: less tells no gain
@@ -36,6 +37,7 @@ class Taps(NamedTuple):
         offset_dn [block row, block column]: level without signal less its mean, DN.
         noise_dn: temporal noise of the typical pixel without signal, DN.
         gain, gain_error: relative to the mean of the outputs, by the variance that signal adds; NaN without signal.
+        change_dn: how the blocks wander from frame to frame [frame, block row, block column], DN; None within chance.
     """
 
     rows: int
@@ -45,6 +47,28 @@ class Taps(NamedTuple):
     gain: np.ndarray
     gain_error: np.ndarray
     interleaved: bool
+    change_dn: np.ndarray | None = None
+
+    @property
+    def wander_dn(self) -> tuple[float, float]:
+        """Standard deviation of an output's change from frame to frame, and its error, DN; from outputs side by side.
+
+        What frames and rows share, outputs one above the other share, too.
+        """
+        if self.change_dn is None:
+            return 0.0, np.inf
+        variance, few = _side_by_side(self.change_dn)
+        return float(np.sqrt(variance)), float(np.sqrt(variance / (2 * few)))
+
+    def changes_dn2(self) -> dict[str, float]:
+        """Variance of frames, and of rows and columns in them, that wandering outputs make in these frames, DN^2."""
+        if self.change_dn is None:
+            return {}
+        frames, rows, columns = self.change_dn.shape
+        beside = self.change_dn - self.change_dn.mean((1, 2), keepdims=True)
+        of = {name: float(np.sum(beside.mean(axis) ** 2)) / (frames - 1) for name, axis in (("row", 2), ("column", 1))}
+        per_frame = self.wander_dn[0] ** 2 / (rows * columns)
+        return {"frame": per_frame, "row_x_frame": of["row"] / rows, "column_x_frame": of["column"] / columns}
 
     def of_lines_dn(self, axis: str, lines: int) -> np.ndarray:
         """Mean offset of each of the rows or columns of a plane [line], DN."""
@@ -86,7 +110,30 @@ def taps_of(found: Survey) -> Taps | None:
     noise_dn = np.sqrt(np.maximum(variance, 0.0))
     if offset.var() < LEAST * variance.mean() and noise_dn.std() < LEAST_NOISE * noise_dn.mean():
         return None
-    return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds, at_rest), interleaved)
+    change = None if interleaved else _changes(group, rows, columns, float(variance.mean()))
+    return Taps(rows, columns, offset, noise_dn, *_gains(found, bounds, at_rest), interleaved, change)
+
+
+def _changes(group: Group, rows: int, columns: int, noise_dn2: float) -> np.ndarray | None:
+    """How outputs wander from frame to frame [frame, block row, block column], DN; None within chance, and of one."""
+    of_planes = [plane.blocks_dn for plane in group.planes if plane.blocks_dn is not None]
+    if columns < 2 or not of_planes:
+        return None
+    blocks = np.mean(of_planes, axis=0)
+    change = blocks.reshape(len(blocks), rows, 2 // rows, columns, -1).mean((2, 4))
+    variance, few = _side_by_side(change)
+    columns_dn2 = float(np.mean([p.components["column_x_frame"].chance_dn2 for p in group.planes]))
+    chance = noise_dn2 * change[0].size / _map(group, "pair_variance_dn2").size / len(of_planes) + columns_dn2
+    is_there = variance > max(WANDERS * (1 + np.sqrt(2 / few)) * chance, LEAST * noise_dn2)
+    return change if is_there else None
+
+
+def _side_by_side(change: np.ndarray) -> tuple[float, float]:
+    """Variance of an output's change, DN^2, by how those of a row differ, and its degrees of freedom."""
+    frames, rows, columns = change.shape
+    beside = change - change.mean(2, keepdims=True)
+    few = (frames - 1) * rows * (columns - 1)
+    return float((beside**2).sum()) / few, few
 
 
 def alternating(found: Survey) -> Taps | None:
@@ -140,7 +187,13 @@ def _lines_levelled(plane: Plane, taps: Taps) -> Plane:
         means[f"{axis}_mean_dn"], one = after, components[axis]
         less = float(before.var(ddof=1) - after.var(ddof=1))
         components[axis] = replace(one, variance_dn2=one.variance_dn2 - less)
-    return replace(plane, components=components, **means)
+    together = {"row_x_frame": plane.rows_together, "column_x_frame": plane.columns_together}
+    for name, less in taps.changes_dn2().items():
+        of_lines = (components[name], *together.get(name, ()))
+        components[name], *rest = (replace(one, variance_dn2=one.variance_dn2 - less) for one in of_lines)
+        together |= {name: tuple(rest)} if rest else {}
+    both = {"rows_together": together["row_x_frame"], "columns_together": together["column_x_frame"]}
+    return replace(plane, components=components, **both, **means)
 
 
 def _map(group: Group, name: str) -> np.ndarray:
