@@ -7,7 +7,7 @@ import pytest
 
 import hsnoise
 import hsnoise.effects as fx
-from hsnoise.statistics.pixels.waves import middle_of_frame, spectrum_of, wave_of
+from hsnoise.statistics.pixels.waves import middle_of_frame, spectrum_of, waves_of
 
 SHAPE, FRAMES, READ_E, GAIN = (160, 200), 8, 4.0, 2.0
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -29,7 +29,7 @@ def capture(row, column, amplitude_e, seed=0, cfa="mono"):
 
 
 def found_in(*frames):
-    return wave_of([spectrum_of([middle_of_frame(frame) for frame in of], 1) for of in frames])
+    return next(iter(waves_of([spectrum_of([middle_of_frame(frame) for frame in of], 1) for of in frames])), None)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_is_no_wave(frames):
 
 def test_small_frames_and_single_ones_show_none():
     assert spectrum_of([np.zeros(SHAPE)], 1) is None and spectrum_of([np.zeros((32, 200))] * 4, 1) is None
-    assert wave_of([]) is None
+    assert waves_of([]) == ()
     assert middle_of_frame(np.zeros((2001, 47))).shape == (512, 46)
 
 
@@ -123,3 +123,46 @@ def test_it_is_a_sinusoid_of_new_phase_along_rows_and_columns():
     np.testing.assert_allclose((basis @ sizes).T.reshape(drawn.shape), drawn, atol=1e-4)
     np.testing.assert_allclose(np.hypot(*sizes), 3.0, rtol=1e-4)
     assert abs(np.exp(1j * np.arctan2(*sizes)).mean()) < 4 / np.sqrt(200)
+
+
+def harmonics(number, of_row=0.137, of_column=0.271):
+    """Frequencies of a clock's harmonics on a sensor whose rows are read one after the other."""
+    return [((k * of_row + 0.5) % 1 - 0.5, k * of_column % 1) for k in range(1, number + 1)]
+
+
+def test_harmonics_of_a_clock_are_found_beside_the_first_and_drawn():
+    rng, frames, sizes = np.random.default_rng(3), 12, (1.2, 0.8, 0.6, 0.5)
+    places = [(row, c) if c <= 0.5 else (-row, 1 - c) for row, c in harmonics(4)]
+    counts = 500 + 4 * rng.standard_normal((frames, *SHAPE))
+    counts += sum(waves(rng, frames, *place, size) for place, size in zip(places, sizes, strict=True))
+    counts += 0.5 * rng.standard_normal((1, *SHAPE)) + 0.5 * rng.standard_normal((1, 1, SHAPE[1]))
+    stack = hsnoise.FrameStack([np.rint(counts).astype(np.uint16)], [0.0])
+    fit = hsnoise.fit(stack)
+    effect = fit.params["interference"]
+    found = {(float(effect.row_frequency), float(effect.column_frequency)): float(effect.amplitude)}
+    found |= {(row, column): size * float(effect.amplitude) for size, row, column in effect.others}
+    assert len(found) == len(places)
+    for (row, column), size in zip(places, sizes, strict=True):
+        near = min(found, key=lambda of: abs(of[0] - row) + abs(of[1] - column))
+        assert abs(near[0] - row) + abs(near[1] - column) < 0.002
+        assert abs(found[near] - size) < 0.15
+    value, error, _ = fit.shown["read_noise.sigma"]
+    assert abs(value - 4) < 4 * error + 0.01
+    drawn = np.asarray(hsnoise.sample_dark(1, 16, SHAPE, fit.params), float)
+    again = waves_of([spectrum_of([middle_of_frame(frame) for frame in drawn], 1)])
+    assert len(again) == len(places)
+    assert hsnoise.compare(fit.params, stack, seed=2).error < 2
+
+
+@pytest.mark.parametrize("others", [((1.0, 0.1),), ("abc",), ((1.0, 0.1, float("inf")),), 3])
+def test_wrong_further_waves_are_named(others):
+    with pytest.raises(ValueError, match="interference.others: expected three finite numbers"):
+        fx.Interference(1.0, 0.1, 0.2, False, others)
+
+
+def test_a_file_keeps_further_waves(tmp_path):
+    effect = fx.Interference(1.0, 0.1, 0.2, False, ((0.5, 0.2, 0.4), (0.25, -0.3, 0.1)))
+    sensor = (fx.ReadNoise(2.0), fx.Gain(1.0), fx.BlackLevel(100.0), fx.ADC())
+    model = hsnoise.NoiseModel([*sensor, effect], cfa="mono", shutter="global", exposure_s=1.0)
+    model.save(tmp_path / "model.json")
+    assert hsnoise.NoiseModel.load(tmp_path / "model.json")["interference"].others == effect.others

@@ -23,7 +23,7 @@ from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.pixels.comb import comb_in
 from hsnoise.statistics.pixels.row_groups import row_groups_in
-from hsnoise.statistics.pixels.waves import wave_in
+from hsnoise.statistics.pixels.waves import over_first, waves_in
 from hsnoise.statistics.structure import Structure, code_step, moving_line, places, structure
 
 SHORT_SHARE = 0.02  # of the longest exposure: a bias frame, or nearly
@@ -56,7 +56,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
         levels=len(exposures_s) + part.n_exposures - len(darks),
         light_e=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
         line=moving_line(part, drawn, black_level_of(model)),
-        wave=None if (wave := wave_in(part)) is None else (wave.row_frequency, wave.column_frequency),
+        waves=over_first(waves_in(part)),
         places=places(part),
         code_step=code_step(part),
         comb=None if (comb := comb_in(part)) is None else (comb.sigma, tuple(comb.errors.tolist())),

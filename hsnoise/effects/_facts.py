@@ -49,7 +49,8 @@ class CaptureFacts:
         levels: numbers of signal levels: exposures of the darks, and flats.
         light_e: mean photoelectrons of a pixel in the brightest flat; 0 without flats.
         line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
-        wave: cycles per row and per column of the strongest wave that crosses the darks obliquely; None without one.
+        waves: of those that cross the darks obliquely, the strongest first: amplitude over that of the first, cycles
+            per row, cycles per column.
         places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
         comb: rms of the errors of the codes' widths, DN, and the errors of a period; None if none is certain.
@@ -70,7 +71,7 @@ class CaptureFacts:
     levels: int
     light_e: float
     line: tuple[str, float]
-    wave: tuple[float, float] | None
+    waves: tuple[tuple[float, float, float], ...]
     places: Places
     code_step: float | None
     comb: tuple[float, tuple[float, ...]] | None

@@ -127,7 +127,7 @@ class PixelFit:
     row_groups: rows that are read together, if there are.
     taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
     parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
-    wave: what crosses the frame obliquely and moves from frame to frame. It is in no read noise.
+    waves: what crosses the frame obliquely and moves from frame to frame, the strongest first. It is in no read noise.
     comb: codes of unequal width, if they are.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
@@ -139,7 +139,7 @@ class PixelFit:
     taps: Taps | None
     code_step: int
     parity_told: bool
-    wave: Wave | None
+    waves: tuple[Wave, ...]
     comb: Comb | None
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -167,7 +167,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.wave, found.comb
+    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb
     return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
 
 
@@ -202,9 +202,9 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
     if found.code_step > 1:
         coarse = ROUNDING * (found.code_step**2 - 1)
         values[1], floor = max(values[1] - coarse, ROUNDING), max(floor - coarse, ROUNDING)
-    if (wave := found.wave) is not None:
-        values[1], floor = (max(one - wave.variance_dn2, ROUNDING) for one in (values[1], floor))
-        covariance[1, 1] += wave.error_dn2**2
+    of_waves = sum(wave.variance_dn2 for wave in found.waves)
+    values[1], floor = (max(one - of_waves, ROUNDING) for one in (values[1], floor)) if of_waves else (values[1], floor)
+    covariance[1, 1] += sum(wave.error_dn2**2 for wave in found.waves)
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2

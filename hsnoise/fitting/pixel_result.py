@@ -56,6 +56,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING
+from hsnoise.statistics.pixels.waves import over_first
 
 NOMINAL = 50.0  # relative standard error of an unknown gain
 
@@ -241,8 +242,9 @@ def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
     """Sinusoids over rows or columns, or over both, and rows that are read together."""
     found = {}
-    if (crossing := pixel.wave) is not None:
-        amplitude, g = np.sqrt(2 * crossing.variance_dn2), float(gain.mean())
+    if pixel.waves:
+        crossing, g = pixel.waves[0], float(gain.mean())
+        amplitude = np.sqrt(2 * crossing.variance_dn2)
         found["interference"] = {
             "amplitude": (amplitude / g, crossing.error_dn2 / amplitude / g),
             "row_frequency": (crossing.row_frequency, np.inf),
@@ -344,6 +346,9 @@ def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[
         return dict(zip(("rows", "start", "row_banks", "column_banks"), groups.layout, strict=True))
     if name in ("tap_offsets", "tap_gains") and pixel.taps is not None:
         return {"taps": pixel.taps.columns, "row_taps": pixel.taps.rows}
+    if name == "interference" and len(pixel.waves) > 1:
+        others = over_first(pixel.waves)[1:]
+        return {"others": tuple(tuple(float(f"{x:.5g}") for x in other) for other in others)}
     if name == "adc_nonuniformity" and (comb := pixel.comb) is not None:
         return {"period": len(comb.errors), "pattern": np.round(comb.errors / comb.sigma, 2)}
     jumps = pixel.channels[0].jumps

@@ -36,7 +36,7 @@ def carries_no_gain(seen: Evidence, method: str) -> bool:
         # A likelihood adds nothing where flats give the gain, and what the paper's model lacks changes the shapes.
         if summary.flats is not None:
             return has_patterns(found) or responses_differ(found)
-        return has_patterns(found) or found.wave is not None or found.comb is not None or bool(found.along)
+        return has_patterns(found) or bool(found.waves) or found.comb is not None or bool(found.along)
     fell = fall_of(found) is not None  # pedestals that jump this far look like a signal
     if variance_grows(found) and not fell:
         return False

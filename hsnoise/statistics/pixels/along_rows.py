@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS
-from hsnoise.statistics.pixels.waves import Wave, without_wave
+from hsnoise.statistics.pixels.waves import Wave, without_waves
 
 NEAR, FAR = np.arange(1, 5), np.arange(9, 17)  # pixels apart: what is measured, and what is common to a row
 MOST_PAIRS, MOST_PIXELS = 4, 1 << 20  # of frames, and of one frame
@@ -48,12 +48,12 @@ class Ringing(NamedTuple):
 
 
 def along_rows(
-    counts: np.ndarray, colours: int, rows: np.ndarray | None = None, wave: Wave | None = None
+    counts: np.ndarray, colours: int, rows: np.ndarray | None = None, waves: Sequence[Wave] = ()
 ) -> Along | None:
     """Of frames [frame, row, column] of one exposure, `colours` taking turns in a row; None if they do not show it.
 
     From the change between two frames, without outliers and what rows or columns share. rows: their numbers on the
-    sensor; None if they follow each other. wave: that crosses these frames, and is no part of it.
+    sensor; None if they follow each other. waves: that cross these frames, and are no part of it.
     """
     pairs, columns = min(len(counts) // 2, MOST_PAIRS), counts.shape[2]
     if not pairs or columns <= 4 * FAR[-1]:
@@ -61,7 +61,7 @@ def along_rows(
     frames = counts[: 2 * pairs, : max(MOST_PIXELS // columns, 1)].astype(np.float32)
     numbers = np.arange(frames.shape[1]) if rows is None else rows[: frames.shape[1]]
     changes = frames[1::2] - frames[::2]
-    changes = changes if wave is None else without_wave(changes, wave, numbers)
+    changes = without_waves(changes, waves, numbers) if waves else changes
     several = [_bounded(change, colours) for change in changes]
     variance = float(np.mean([np.mean(x**2, dtype=np.float64) for x in several])) / 2
     if variance < NARROWEST**2:

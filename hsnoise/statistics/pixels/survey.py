@@ -20,7 +20,7 @@ from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_o
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
-from hsnoise.statistics.pixels.waves import MOST_FRAMES, Spectrum, Wave, middle_of_frame, spectrum_of, wave_of
+from hsnoise.statistics.pixels.waves import MOST_FRAMES, Spectrum, Wave, middle_of_frame, spectrum_of, waves_of
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
@@ -186,9 +186,9 @@ class Survey:
         return None if self.shortest is None else self.shortest.row_groups
 
     @cached_property
-    def wave(self) -> Wave | None:
-        """The strongest wave that crosses the darks obliquely, if any."""
-        return wave_of([group.spectrum for group in self.darks if group.spectrum is not None])
+    def waves(self) -> tuple[Wave, ...]:
+        """The waves that cross the darks obliquely, the strongest first."""
+        return waves_of([group.spectrum for group in self.darks if group.spectrum is not None])
 
     @cached_property
     def comb(self) -> Comb | None:
@@ -273,7 +273,7 @@ def _group(
     groups = row_groups_of(np.stack(means), first_row, planes[0].banding.get("row")) if means else None
     spectrum = spectrum_of(middles, step)
     of_frames = (
-        along_rows(kept, step, rows, wave_of([] if spectrum is None else [spectrum])),
+        along_rows(kept, step, rows, waves_of([] if spectrum is None else [spectrum])),
         groups,
         register_of(kept) if step == 1 and stack.kind[i] == "dark" else None,
         spectrum,

@@ -17,7 +17,9 @@ LEAST_SIDE = 64
 CORE_SIGMAS = 4.0  # outliers are clipped there
 LEAST_CYCLES = 4  # in the part that is looked at: slower ones along an axis are bands, or drifts
 NEAR, AROUND = 3, 12  # points of the spectrum that belong to a wave, and among which it stands out
-SHARP = 30.0  # times the power around it
+SHARP, SHARP_BESIDE = 30.0, 8.0  # times the power around it; beside one that is there
+RARE = 1e-3  # probability that a point of a spectrum of noise stands out
+MOST_WAVES, MOST_TAKEN = 24, 4  # that a model has, and that are taken off where neighbours are compared
 BLOCK = (64, 256)  # rows and columns over which a wave keeps its frequency as it was measured
 ALIKE = 2.0  # times the least noise, beyond which exposures tell nothing
 
@@ -73,10 +75,13 @@ def spectrum_of(parts: Sequence[np.ndarray], cell: int) -> Spectrum | None:
     return Spectrum(power.mean(0), np.square(power).mean(0), len(left), left.shape[1:], cell)
 
 
-def wave_of(spectra: Sequence[Spectrum]) -> Wave | None:
-    """The strongest wave in exposures of a sensor; None if no point of their spectrum stands out."""
+def waves_of(spectra: Sequence[Spectrum]) -> tuple[Wave, ...]:
+    """The waves in exposures of a sensor, the strongest first; none if no point of their spectrum stands out.
+
+    A clock that couples in brings its harmonics. Beside a first wave, weaker ones are taken as far as chance allows.
+    """
     if not spectra:
-        return None
+        return ()
     usual = [float(np.median(one.power)) for one in spectra]
     alike = [one for one, of in zip(spectra, usual, strict=True) if of <= ALIKE * min(usual)]
     weights = np.array([one.n_frames for one in alike], float)
@@ -84,12 +89,33 @@ def wave_of(spectra: Sequence[Spectrum]) -> Wave | None:
     (rows, columns), cell = alike[0].shape, alike[0].cell
     slow = _is_slow(np.fft.fftfreq(rows), rows, cell)[:, None] | _is_slow(np.fft.rfftfreq(columns), columns, cell)
     seen = np.where(slow, 0.0, power)
-    r, c = np.unravel_index(int(seen.argmax()), seen.shape)
-    around = max(_beside(seen[:, c], int(r), wraps=True), _beside(seen[r], int(c), wraps=False))
-    near = np.take(power[:, max(c - 1, 0) : c + 2], [r - 1, r, r + 1], axis=0, mode="wrap")
-    # Beside a band it may be the foot of its peak.
-    if near.max() > power[r, c] or not seen[r, c] > SHARP * max(around, float(np.median(power))):
-        return None
+    floor, free, found = float(np.median(power)), seen > 0, []
+    sharp = max(SHARP, _by_chance(int((weights - 1).sum()), power.size))
+    while len(found) < MOST_WAVES:
+        r, c = (int(i) for i in np.unravel_index(int(np.where(free, seen, 0.0).argmax()), seen.shape))
+        around = max(_beside(seen[:, c], r, wraps=True), _beside(seen[r], c, wraps=False))
+        near = np.take(power[:, max(c - 1, 0) : c + 2], [r - 1, r, r + 1], axis=0, mode="wrap")
+        if not seen[r, c] > sharp * max(around, floor):
+            break
+        if near.max() <= power[r, c]:  # else it may be the foot of a band's peak, or of another wave's
+            found.append(_wave_at(power, square, r, c, around, weights))
+        elif not found:
+            break
+        beside = np.arange(r - NEAR, r + NEAR + 1) % rows
+        free[beside[:, None], np.arange(max(c - NEAR, 0), min(c + NEAR + 1, free.shape[1]))] = False
+        sharp = max(SHARP_BESIDE, _by_chance(int((weights - 1).sum()), power.size))
+    return tuple(found)
+
+
+def _by_chance(frames: int, points: int) -> float:
+    """Power of noise over its median that hardly any of so many points reaches, in the mean of so many spectra."""
+    law = scipy.stats.gamma(max(frames, 1))
+    return float(law.isf(RARE / points) / law.median())
+
+
+def _wave_at(power: np.ndarray, square: np.ndarray, r: int, c: int, around: float, weights: np.ndarray) -> Wave:
+    """The wave at a point of the spectrum, beside which the power is `around`; weights: numbers of frames."""
+    rows, columns = len(power), 2 * (power.shape[1] - 1)
     row = _off(np.take(power[:, c], [r - 1, r, r + 1], mode="wrap"))
     column = _off(power[r, c - 1 : c + 2]) if c < power.shape[1] - 1 else 0.0
     # Alternating signs are one wave; any other is the sum of two that turn in opposite senses.
@@ -103,20 +129,28 @@ def wave_of(spectra: Sequence[Spectrum]) -> Wave | None:
     return Wave(frequency - (frequency > 0.5), (float(c) + column) / columns, size * (power[r, c] - around), error)
 
 
+def over_first(waves: Sequence[Wave]) -> tuple[tuple[float, float, float], ...]:
+    """Amplitude over that of the first, cycles per row and cycles per column of each."""
+    return tuple(
+        (float(np.sqrt(max(wave.variance_dn2 / waves[0].variance_dn2, 0.0))), wave.row_frequency, wave.column_frequency)
+        for wave in waves
+    )
+
+
 def _is_slow(frequency: np.ndarray, lines: int, cell: int) -> np.ndarray:
     """Which frequencies are hardly more than none, or in pixels of one colour look so: they are bands, or offsets."""
     turns = frequency * cell
     return np.abs(turns - np.rint(turns)) * lines < LEAST_CYCLES * cell
 
 
-def wave_in(stack: FrameStack) -> Wave | None:
-    """The strongest wave in the darks of a stack, of which a few frames are read."""
+def waves_in(stack: FrameStack) -> tuple[Wave, ...]:
+    """The waves in the darks of a stack, of which a few frames are read, the strongest first."""
     spectra = []
     for i, kind in enumerate(stack.kind):
         if kind == "dark":
             parts = [middle_of_frame(frame) for frame in islice(stack.frames(i), MOST_FRAMES)]
             spectra.append(spectrum_of(parts, len(cfa_tile(stack.cfa))))
-    return wave_of([one for one in spectra if one is not None])
+    return waves_of([one for one in spectra if one is not None])
 
 
 def _beside(line: np.ndarray, at: int, *, wraps: bool) -> float:
@@ -140,19 +174,24 @@ def _seen(off: float) -> float:
     return float((np.sinc(off) / (1 - off**2)) ** 2)
 
 
-def without_wave(change: np.ndarray, wave: Wave, rows: np.ndarray) -> np.ndarray:
-    """Differences of frames [frame, row, column] less the wave; rows: their numbers on the sensor.
+def without_waves(change: np.ndarray, waves: Sequence[Wave], rows: np.ndarray) -> np.ndarray:
+    """Differences of frames [frame, row, column] less the strongest waves; rows: their numbers on the sensor.
 
     In blocks, so that a frequency that is slightly off does no harm.
     """
-    left = change.copy()
+    left, strongest = change.copy(), waves[:MOST_TAKEN]
+    if not strongest:
+        return left
     for top in range(0, change.shape[1], BLOCK[0]):
         for first in range(0, change.shape[2], BLOCK[1]):
             at = (slice(None), slice(top, top + BLOCK[0]), slice(first, first + BLOCK[1]))
             part = change[at]
-            down, across = rows[at[1]] * wave.row_frequency, np.arange(first, first + part.shape[2])
-            turns = down[:, None] + across * wave.column_frequency
-            both = np.stack([np.cos(2 * np.pi * turns).ravel(), np.sin(2 * np.pi * turns).ravel()], 1)
-            sizes = np.linalg.lstsq(both, part.reshape(len(part), -1).T, rcond=1e-6)[0]
-            left[at] -= (both @ sizes).T.reshape(part.shape).astype(left.dtype)
+            both = []
+            for wave in strongest:
+                down, across = rows[at[1]] * wave.row_frequency, np.arange(first, first + part.shape[2])
+                turns = 2 * np.pi * (down[:, None] + across * wave.column_frequency).ravel()
+                both += [np.cos(turns), np.sin(turns)]
+            waving = np.stack(both, 1)
+            sizes = np.linalg.lstsq(waving, part.reshape(len(part), -1).T, rcond=1e-6)[0]
+            left[at] -= (waving @ sizes).T.reshape(part.shape).astype(left.dtype)
     return left
