@@ -154,6 +154,14 @@ def test_harmonics_of_a_clock_are_found_beside_the_first_and_drawn():
     assert hsnoise.compare(fit.params, stack, seed=2).error < 2
 
 
+@pytest.mark.parametrize("row", [0.5, 0.2, -0.31])
+def test_a_wave_of_half_a_cycle_per_column_is_one_wave(row):
+    rng, frames = np.random.default_rng(5), 16
+    moving = 100 + 3 * rng.standard_normal((frames, *SHAPE)) + waves(rng, frames, row, 0.5, 1.0)
+    (found,) = waves_of([spectrum_of([middle_of_frame(frame) for frame in moving], 1)])
+    assert abs(found.variance_dn2 - 0.5) < 4 * found.error_dn2 < 0.8
+
+
 @pytest.mark.parametrize("others", [((1.0, 0.1),), ("abc",), ((1.0, 0.1, float("inf")),), 3])
 def test_wrong_further_waves_are_named(others):
     with pytest.raises(ValueError, match="interference.others: expected three finite numbers"):

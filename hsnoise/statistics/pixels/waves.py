@@ -101,8 +101,11 @@ def waves_of(spectra: Sequence[Spectrum]) -> tuple[Wave, ...]:
             found.append(_wave_at(power, square, r, c, around, weights))
         elif not found:
             break
-        beside = np.arange(r - NEAR, r + NEAR + 1) % rows
-        free[beside[:, None], np.arange(max(c - NEAR, 0), min(c + NEAR + 1, free.shape[1]))] = False
+        beside = np.arange(-NEAR, NEAR + 1)
+        of_columns = np.arange(max(c - NEAR, 0), min(c + NEAR + 1, free.shape[1]))
+        free[(r + beside[:, None]) % rows, of_columns] = False
+        if c + NEAR >= free.shape[1]:  # of half a cycle per column, the mirror image is the same wave
+            free[(beside[:, None] - r) % rows, of_columns] = False
         sharp = max(SHARP_BESIDE, _by_chance(int((weights - 1).sum()), power.size))
     return tuple(found)
 
