@@ -21,6 +21,7 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
+from hsnoise.statistics.panels import may_be_outputs
 from hsnoise.statistics.pixels.comb import comb_in
 from hsnoise.statistics.pixels.row_groups import row_groups_in
 from hsnoise.statistics.pixels.waves import over_first, waves_in
@@ -57,6 +58,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
         light_e=max(float(light_of(model, part, i).mean()) for i in range(part.n_exposures)),
         line=moving_line(part, drawn, black_level_of(model)),
         waves=over_first(waves_in(part)),
+        may_be_outputs=may_be_outputs(part, drawn),
         places=places(part),
         code_step=code_step(part),
         comb=None if (comb := comb_in(part)) is None else (comb.sigma, tuple(comb.errors.tolist())),

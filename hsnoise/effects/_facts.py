@@ -51,6 +51,7 @@ class CaptureFacts:
         line: axis ("row" or "column") and frequency, cycles/pixel, of the strongest line that moves between frames.
         waves: of those that cross the darks obliquely, the strongest first: amplitude over that of the first, cycles
             per row, cycles per column.
+        may_be_outputs: whether panels describe what is static over the frame and not in the model, as far as it shows.
         places: where static patterns lie, and signs.
         code_step: distance of the codes, DN; None if all occur.
         comb: rms of the errors of the codes' widths, DN, and the errors of a period; None if none is certain.
@@ -72,6 +73,7 @@ class CaptureFacts:
     light_e: float
     line: tuple[str, float]
     waves: tuple[tuple[float, float, float], ...]
+    may_be_outputs: bool
     places: Places
     code_step: float | None
     comb: tuple[float, tuple[float, ...]] | None

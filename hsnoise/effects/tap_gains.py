@@ -47,7 +47,9 @@ class TapGains(AbstractEffect):
         return signal * gains[tap_of(capture, self.taps, self.row_taps)][None]
 
     @classmethod
-    def propose(cls, facts: CaptureFacts) -> Maker:
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.may_be_outputs:
+            return None
         # Five percent of the noise of many pixels; sensors have two outputs, four or eight, or one at each corner.
         layouts = ((2, 1), (4, 1), (8, 1), (1, 2), (2, 2))
         return lambda size, rng: cls(0.05 * size, *layouts[rng.integers(len(layouts))])

@@ -54,7 +54,9 @@ class TapOffsets(AbstractEffect):
         return signal + capture.offset(self.sigma * fixed + self.frame_sigma * moving, self.after_gain)
 
     @classmethod
-    def propose(cls, facts: CaptureFacts) -> Maker:
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not facts.may_be_outputs:
+            return None
         # A quarter of the read noise between blocks of many columns; sensors have two outputs, four or eight.
         read = facts.read_noise_e
         return lambda size, rng: cls(0.25 * size * read, int(rng.choice([2, 4, 8])), either_side(rng))

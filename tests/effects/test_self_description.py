@@ -57,6 +57,7 @@ RICH = CaptureFacts(
     places=Places(("column", "last", True, 0.3), (1.0, 0.5), -1, 1),
     code_step=None,
     comb=(0.1, (1.0, -1.0)),
+    may_be_outputs=True,
     row_groups=(8, 4, 2, 2),
 )
 POOR = dataclasses.replace(
