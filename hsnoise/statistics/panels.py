@@ -10,10 +10,10 @@ from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 
 GRID = 16  # blocks along each side, whose means are compared
-LAYOUTS = ((1, 2), (1, 4), (1, 8), (1, 16), (2, 1), (2, 2), (2, 4))  # outputs over the rows, over the columns
-THERE = 3.0  # times the variance by chance, from which there is structure
-MOST = 0.3  # of it that panels may leave
-MARGIN, SLACK = 30.0, 0.02  # of chi2, and of that of all structure, by which a smooth surface must be better
+LAYOUTS = ((1, 2), (1, 4), (1, 8), (2, 1), (2, 2), (2, 4))  # outputs over the rows, over the columns
+THERE = 2.0  # times the variance by chance, from which there is structure
+MOST = 0.15  # of it that panels may leave
+MARGIN = 30.0  # of chi2, by which a smooth surface must be better
 
 
 def may_be_outputs(stack: FrameStack, drawn: Sequence[FrameStack]) -> bool:
@@ -27,12 +27,11 @@ def may_be_outputs(stack: FrameStack, drawn: Sequence[FrameStack]) -> bool:
         return True
     by_time = sorted(darks, key=lambda i: stack.exposure_s[i])
     ends = {by_time[0], by_time[-1]}
-    maps = [(_halves(stack, i), np.mean([_halves(one, i) for one in drawn], axis=(0, 1))) for i in ends]
-    seen, chance = max(
-        ((halves.mean(0) - of_model, float(np.var(halves[0] - halves[1])) / 4 + 1e-12) for halves, of_model in maps),
-        key=lambda pair: pair[0].var() / pair[1],
-    )
-    return _are_panels(seen, chance)
+    maps = [_halves(stack, i) - np.mean([_halves(one, i) for one in drawn], axis=(0, 1)) for i in ends]
+    beside = [halves - halves.mean(2, keepdims=True) for halves in maps]
+    # What rows share, their slow noise has, too: if columns show structure, that decides.
+    of_columns, of_all = (max(some, key=_whole) for some in (beside, maps))
+    return _are_panels(of_columns if _whole(of_columns) > THERE else of_all)
 
 
 def _halves(stack: FrameStack, i: int) -> np.ndarray:
@@ -57,13 +56,24 @@ def _halves(stack: FrameStack, i: int) -> np.ndarray:
     return blocks / sizes[0][:, None] / sizes[1]
 
 
-def _are_panels(seen: np.ndarray, chance: float) -> bool:
-    """Whether panels explain a map of block means of that variance by chance, and not worse than a smooth surface."""
+def _chance(halves: np.ndarray) -> float:
+    """Variance by chance of the mean of two maps of block means."""
+    return float(np.var(halves[0] - halves[1])) / 4 + 1e-12
+
+
+def _whole(halves: np.ndarray) -> float:
+    """Variance of block means over that by chance."""
+    return float(np.var(halves.mean(0))) / _chance(halves)
+
+
+def _are_panels(halves: np.ndarray) -> bool:
+    """Whether panels explain two maps of block means, and not worse than a smooth surface."""
+    seen, chance = halves.mean(0), _chance(halves)
     free = seen.size - 1
-    whole = float(np.sum((seen - seen.mean()) ** 2)) / chance
+    whole = free * _whole(halves)
     panels = min(float(np.sum((seen - _panels(seen, *layout)) ** 2)) for layout in LAYOUTS) / chance
     surface = float(np.sum((seen - _surface(seen)) ** 2)) / chance
-    if panels - surface > MARGIN + SLACK * whole:
+    if panels - surface > MARGIN:
         return False
     return whole < THERE * free or panels - free < MOST * (whole - free)
 
