@@ -19,6 +19,7 @@ from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation import portion as cutting
 from hsnoise.simulation import simulator as drawing
+from hsnoise.simulation.draws import _without_spikes
 from hsnoise.simulation.portion import LEAST_COLUMNS, LEAST_FRAMES, Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import Structure
@@ -234,3 +235,12 @@ def test_copies_and_flats_alone_are_refused():
     counts[1, 2] = counts[0, 1]
     with pytest.raises(ValueError, match=r"frame 1 of the 0.02 s exposure and frame 2 of the 0.1 s exposure"):
         Portion.of(FrameStack(counts, EXPOSURE_S))
+
+
+def test_counts_of_dim_flats_are_no_spikes():
+    """Where nearly all pixels have the same count, those with another one are noise; hot pixels are not."""
+    plane = np.zeros((40, 50))
+    plane[::3, ::2] = 1.0
+    np.testing.assert_array_equal(_without_spikes(plane), plane)
+    hot = plane + 300 * (np.arange(50) == 7) * (np.arange(40) == 9)[:, None]
+    np.testing.assert_array_equal(_without_spikes(hot)[9, 7] < 2, True)

@@ -19,7 +19,7 @@ from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
 
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
-SPIKE = 8.0  # deviations of a pixel from the median of those around it
+SPIKE, LEAST_DN = 8.0, 0.5  # deviations of a pixel from the median of those around it; the least of these
 SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
 
 
@@ -135,4 +135,5 @@ def _without_spikes(plane: np.ndarray) -> np.ndarray:
     """The plane with the median of their surroundings in place of single pixels that lie far from it."""
     beside = scipy.ndimage.median_filter(plane, 3, mode="mirror")
     off = np.abs(plane - beside)
-    return np.where(off > SPIKE * 1.4826 * float(np.median(off)), beside, plane)
+    usual = max(1.4826 * float(np.median(off)), LEAST_DN)  # where most pixels have the same count, others are no spikes
+    return np.where(off > SPIKE * usual, beside, plane)
