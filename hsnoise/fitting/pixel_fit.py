@@ -202,9 +202,10 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
     if found.code_step > 1:
         coarse = ROUNDING * (found.code_step**2 - 1)
         values[1], floor = max(values[1] - coarse, ROUNDING), max(floor - coarse, ROUNDING)
-    of_waves = sum(wave.variance_dn2 for wave in found.waves)
-    values[1], floor = (max(one - of_waves, ROUNDING) for one in (values[1], floor)) if of_waves else (values[1], floor)
-    covariance[1, 1] += sum(wave.error_dn2**2 for wave in found.waves)
+    if found.waves:
+        of_waves = sum(wave.variance_dn2 for wave in found.waves)
+        values[1], floor = (max(one - of_waves, ROUNDING) for one in (values[1], floor))
+        covariance[1, 1] += sum(wave.error_dn2**2 for wave in found.waves)
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2

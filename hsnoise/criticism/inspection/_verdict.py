@@ -191,7 +191,7 @@ def _read_noise_sentence(repeated: Sequence[GroupFacts], has_gain: bool, budget:
 def _dark_current_sentence(repeated: Sequence[GroupFacts], relative: float) -> str:
     exposures = {group.exposure_s for group in repeated}
     if len(exposures) < 2:
-        return "Dark current: no; it needs darks of at least two exposures"
+        return "Dark current: no; it needs two darks or more at each of two exposures"
     first, last = min(repeated, key=lambda g: g.exposure_s), max(repeated, key=lambda g: g.exposure_s)
     if relative >= ROUGH and last.hot_dn > max(HOTTER * first.hot_dn, first.hot_dn + HOTTER_DN):
         return "Dark current: only of hot pixels, which grow with exposure; most pixels hardly do"
