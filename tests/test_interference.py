@@ -162,9 +162,20 @@ def test_a_wave_of_half_a_cycle_per_column_is_one_wave(row):
     assert abs(found.variance_dn2 - 0.5) < 4 * found.error_dn2 < 0.8
 
 
-@pytest.mark.parametrize("others", [((1.0, 0.1),), ("abc",), ((1.0, 0.1, float("inf")),), 3])
+@pytest.mark.parametrize(
+    "others",
+    [
+        ((1.0, 0.1),),
+        ("abc",),
+        ((1.0, 0.1, float("inf")),),
+        3,
+        ((-1.0, 0.1, 0.2),),
+        ((1.0, 0.7, 0.2),),
+        ((True, 0.1, 0.2),),
+    ],
+)
 def test_wrong_further_waves_are_named(others):
-    with pytest.raises(ValueError, match="interference.others: expected three finite numbers"):
+    with pytest.raises(ValueError, match="interference.others: expected for each its amplitude"):
         fx.Interference(1.0, 0.1, 0.2, False, others)
 
 

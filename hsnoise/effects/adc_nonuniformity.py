@@ -16,6 +16,7 @@ from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
 MOST_CODES = 1 << 16  # of a converter
+LARGEST = 1e6  # error of a pattern, which may have any unit
 NARROWEST_DN = 1.2  # of noise over whose codes a pattern shows
 
 
@@ -61,9 +62,9 @@ class AdcNonuniformity(AbstractEffect):
         if self.pattern is None:
             return
         numbers = isinstance(self.pattern, tuple) and all(
-            isinstance(x, Real) and not isinstance(x, bool) and np.isfinite(x) for x in self.pattern
+            isinstance(x, Real) and not isinstance(x, bool) and abs(x) <= LARGEST for x in self.pattern
         )
-        if not numbers or len(self.pattern) != self.period or np.ptp(self.pattern) == 0:
+        if not numbers or len(self.pattern) != self.period or np.ptp(self.pattern) < 1 / LARGEST:
             expected = f"expected {self.period} finite numbers (period) that differ"
             raise ValueError(f"adc_nonuniformity.pattern: {expected}, got {self.pattern!r:.60}.")
 

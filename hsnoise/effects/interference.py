@@ -10,18 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.keys import named_key
 from hsnoise._core.types import Frames, RandomKey, Scalar, cfa_tile
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker, either_side
 from hsnoise.effects._parameters import param
 
-MOST_OTHERS = 256
+MOST_OTHERS, LARGEST = 256, 1e6
 
 
 def as_tuples(others):
     """Waves as a setting can hold them; files have lists."""
-    return tuple(tuple(one) if isinstance(one, list) else one for one in others) if isinstance(others, list) else others
+    others = others.tolist() if isinstance(others, np.ndarray) else others
+    if not isinstance(others, list | tuple):
+        return others
+    return tuple(tuple(one) if isinstance(one, list) else one for one in others)
 
 
 class Interference(AbstractEffect):
@@ -55,10 +57,9 @@ class Interference(AbstractEffect):
     def __check_init__(self):
         for other in self.others if isinstance(self.others, tuple) else (self.others,):
             numbers = isinstance(other, tuple) and len(other) == 3
-            if not numbers or not all(isinstance(x, Real) and np.isfinite(x) for x in other):
-                expected = (
-                    "expected three finite numbers for each: amplitude over the first, cycles per row, per column"
-                )
+            numbers = numbers and all(isinstance(x, Real) and not isinstance(x, bool) for x in other)
+            if not numbers or not (0 <= other[0] <= LARGEST and abs(other[1]) <= 0.5 and 0 <= other[2] <= 0.5):
+                expected = "expected for each its amplitude over the first, cycles per row and per column within 0.5"
                 raise ValueError(f"interference.others: {expected}, got {other!r:.60}.")
         if len(self.others) > MOST_OTHERS:
             raise ValueError(f"interference.others: expected at most {MOST_OTHERS} waves, got {len(self.others)}.")
@@ -78,7 +79,7 @@ class Interference(AbstractEffect):
         """The further waves, over the amplitude of the first: sums over waves of products of a row and a column."""
         frames, rows, columns = signal.shape
         size, of_row, of_column = jnp.asarray(self.others, signal.dtype).T
-        phase = jax.random.uniform(named_key(key, "others"), (frames, 1, len(self.others)), signal.dtype)
+        phase = jax.random.uniform(jax.random.fold_in(key, 1), (frames, 1, len(self.others)), signal.dtype)
         down = 2 * np.pi * (jnp.arange(rows, dtype=signal.dtype)[None, :, None] * of_row[None, None] % 1 + phase)
         across = 2 * np.pi * (jnp.arange(columns, dtype=signal.dtype)[None, :] * of_column[:, None] % 1)
         parts = jnp.concatenate([size[None, None] * jnp.sin(down), size[None, None] * jnp.cos(down)], -1)

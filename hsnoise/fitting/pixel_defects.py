@@ -28,8 +28,8 @@ def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, d
     return {"hot_pixels": found if fano is None else found | {"fano": fano}}
 
 
-def warm_of(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels from darks of one exposure: charge of the exposure, or of the readout if the exposure is zero."""
+def warm_of(pixel: PixelFit, gain: np.ndarray, exposure_s: float) -> dict[str, dict[str, tuple[float, float]]]:
+    """Hot pixels from repeated darks of one exposure: charge of the exposure, or of the readout if that is zero."""
     many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
     if not many:
         return {}
@@ -37,8 +37,8 @@ def warm_of(pixel: PixelFit, gain: np.ndarray, longest_s: float) -> dict[str, di
     charge = of_colours([(warm.extra_dn[0] / g, warm.extra_dn[1] / g) for warm, g in many])
     tail = of_colours([warm.spread for warm, _ in many])
     hot = {"fraction": fraction} | ({"spread": tail} if tail[0] > 0 else {})
-    if longest_s > 0:
-        return {"hot_pixels": {**hot, "rate": (charge[0] / longest_s, charge[1] / longest_s)}}
+    if exposure_s > 0:
+        return {"hot_pixels": {**hot, "rate": (charge[0] / exposure_s, charge[1] / exposure_s)}}
     return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}
 
 

@@ -128,7 +128,7 @@ class PixelFit:
     taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
     parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
     waves: what crosses the frame obliquely and moves from frame to frame, the strongest first. It is in no read noise.
-    comb: codes of unequal width, if they are.
+    comb: codes of unequal width, if they are. shortest_s: the shortest exposure of repeated darks; 0 without any.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -141,6 +141,7 @@ class PixelFit:
     parity_told: bool
     waves: tuple[Wave, ...]
     comb: Comb | None
+    shortest_s: float
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -154,7 +155,8 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     flats = _flat_gain(found, summary)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
-    channels = [_channel(found, c, name, register, told) for c, name in enumerate(found.channels)]
+    wander_dn2 = 0.0 if taps is None else taps.changes_dn2().get("temporal", 0.0)
+    channels = [_channel(found, c, name, register, told, wander_dn2) for c, name in enumerate(found.channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
     taps, channels, parity_told = outputs_by_light(found, taps, channels)
@@ -168,10 +170,14 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
     shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb
-    return PixelFit(tuple(channels), flats, *shared, estimate, covariance, bool(known.all()))
+    shortest_s = 0.0 if found.shortest is None else found.shortest.exposure_s
+    return PixelFit(tuple(channels), flats, *shared, shortest_s, estimate, covariance, bool(known.all()))
 
 
-def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flats: FlatGain | None) -> Channel:
+def _channel(
+    found: Survey, c: int, name: str, register: Multiplied | None, flats: FlatGain | None, wander_dn2: float
+) -> Channel:
+    """wander_dn2: variance of pixels over time that outputs make whose change is neither of rows nor of columns."""
     (growth, growth_error), black = growth_of_means(found, c)
     narrow = _narrow(found, c)
     is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
@@ -202,9 +208,9 @@ def _channel(found: Survey, c: int, name: str, register: Multiplied | None, flat
     if found.code_step > 1:
         coarse = ROUNDING * (found.code_step**2 - 1)
         values[1], floor = max(values[1] - coarse, ROUNDING), max(floor - coarse, ROUNDING)
-    if found.waves:
-        of_waves = sum(wave.variance_dn2 for wave in found.waves)
-        values[1], floor = (max(one - of_waves, ROUNDING) for one in (values[1], floor))
+    apart_dn2 = wander_dn2 + sum(wave.variance_dn2 for wave in found.waves)
+    if apart_dn2 > 0:
+        values[1], floor = (max(one - apart_dn2, ROUNDING) for one in (values[1], floor))
         covariance[1, 1] += sum(wave.error_dn2**2 for wave in found.waves)
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")

@@ -30,7 +30,18 @@ def offset_of(found: Survey, c: int, population: Population | None) -> tuple[flo
     across = _across(found, c) if sigma > 0 else None
     if across is not None and sigma**2 - across[0] > NOT_SHARED * np.hypot(across[1], 2 * sigma * error):
         return root_of(*across)
-    return sigma, error
+    by_waves = _by_waves(found, c)
+    return (
+        (sigma, error)
+        if by_waves == 0 or not np.isfinite(error)
+        else (sigma, float(np.hypot(error, min(by_waves / max(2 * sigma, 1e-12), np.sqrt(by_waves)))))
+    )
+
+
+def _by_waves(found: Survey, c: int) -> float:
+    """Standard deviation of what two halves of the shortest frames share of waves, whose phases are random, DN^2."""
+    first, second = shortest_of(found, c)[0].halves.n_frames
+    return sum(wave.variance_dn2 for wave in found.waves) / np.sqrt(2 * first * second)
 
 
 def pattern_of(found: Survey, c: int) -> tuple[np.ndarray, float]:

@@ -108,11 +108,10 @@ def followed(found: Survey) -> set[str]:
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
     """The result; `model` says which effects are wanted (None: the paper's, and those of the population found)."""
     gain, read, rate = _electrons(pixel)
-    longest_s = float(np.max(summary.exposure_s, initial=0.0))
     shared = shared_patterns(pixel.channels, gain, summary.cfa)
     if (offsets := offsets_of(pixel.channels, gain, summary.cfa)) is not None:
         shared["dark_signal_nonuniformity"] = offsets
-    population = _with_banks(_population(pixel, gain, shared, longest_s), pixel, model)
+    population = _with_banks(_population(pixel, gain, shared), pixel, model)
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
     black, row = _black(pixel, summary), _rows(pixel)
@@ -174,7 +173,7 @@ def _electrons(pixel: PixelFit) -> tuple[np.ndarray, float, float]:
 
 
 def _population(
-    pixel: PixelFit, gain: np.ndarray, shared: Mapping[str, Shared], longest_s: float
+    pixel: PixelFit, gain: np.ndarray, shared: Mapping[str, Shared]
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """The significant population effects: name to field to (value, error), means over the colours."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
@@ -213,7 +212,7 @@ def _population(
     found |= _responses(pixel)
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
-        return found | warm_of(pixel, gain, longest_s)
+        return found | warm_of(pixel, gain, pixel.shortest_s)
     spread = of_colours(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )

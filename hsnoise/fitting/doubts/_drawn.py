@@ -20,6 +20,7 @@ from hsnoise.model import NoiseModel, sample_by_effect
 from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.survey import Group, Survey, survey
+from hsnoise.statistics.pixels.taps import levelled
 
 FRAMES, SHAPE = 8, (128, 256)  # drawn per exposure
 MOST_EXPOSURES = 4  # drawn: the shortest, the longest, and some between
@@ -33,8 +34,11 @@ def disagreements(result: FitResult, found: Survey) -> Iterator[str]:
     """Sentences on measured noise that the fitted model does not reproduce; none without a gain."""
     if result.stack is None or not result.has_gain or found.shortest is None:
         return
+    taps = None if result.transfer is None else result.transfer.taps
     if "amplifier_glow" in result.params:  # the middle, where frames are drawn, has less of it
         found = _of_the_middle(result.stack, found)
+    elif taps is not None:  # the typical pixel of outputs that lie far apart would be that of either
+        found = levelled(found, taps)
     if "electron_multiplication" in result.params:  # what is an outlier of a skewed noise depends on their number
         found = survey(result.stack.select(frames=slice(0, FRAMES)))
     chosen = _chosen(found)

@@ -61,14 +61,19 @@ class Taps(NamedTuple):
         return float(np.sqrt(variance)), float(np.sqrt(variance / (2 * few)))
 
     def changes_dn2(self) -> dict[str, float]:
-        """Variance of frames, and of rows and columns in them, that wandering outputs make in these frames, DN^2."""
+        """Variance of each component that wandering outputs make in these frames, DN^2."""
         if self.change_dn is None:
             return {}
         frames, rows, columns = self.change_dn.shape
         beside = self.change_dn - self.change_dn.mean((1, 2), keepdims=True)
         of = {name: float(np.sum(beside.mean(axis) ** 2)) / (frames - 1) for name, axis in (("row", 2), ("column", 1))}
-        per_frame = self.wander_dn[0] ** 2 / (rows * columns)
-        return {"frame": per_frame, "row_x_frame": of["row"] / rows, "column_x_frame": of["column"] / columns}
+        left = beside - beside.mean(2, keepdims=True) - beside.mean(1, keepdims=True)
+        return {
+            "frame": self.wander_dn[0] ** 2 / (rows * columns),
+            "row_x_frame": of["row"] / rows,
+            "column_x_frame": of["column"] / columns,
+            "temporal": float(np.mean(np.sum(left**2, 0))) / (frames - 1),
+        }
 
     def of_lines_dn(self, axis: str, lines: int) -> np.ndarray:
         """Mean offset of each of the rows or columns of a plane [line], DN."""
