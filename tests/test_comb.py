@@ -118,3 +118,12 @@ def test_the_pattern_is_what_is_drawn():
 def test_a_wrong_pattern_is_named(wrong):
     with pytest.raises(ValueError, match=r"adc_nonuniformity.pattern: expected 4 finite numbers"):
         fx.AdcNonuniformity(0.1, 4, wrong)
+
+
+def test_a_pattern_of_one_exposure_is_not_the_converters():
+    """Half counts of a level that was scaled by a tenth round to even codes."""
+    rng = np.random.default_rng(8)
+    levels = [rng.normal(level, 12, (4, *SHAPE)) for level in (300, 800, 1500)]
+    scaled = 9000 + 0.1 * np.rint(rng.normal(0, 60, (4, *SHAPE)))
+    assert found_in(np.rint(scaled).astype(np.uint16)) is not None
+    assert found_in(*(np.rint(level).astype(np.uint16) for level in levels), np.rint(scaled).astype(np.uint16)) is None

@@ -89,7 +89,7 @@ def test_what_is_no_capture_is_named(call, folder, counts):
         call(5)
     with pytest.raises(TypeError, match="^stack: expected a list of paths or a list of arrays, got both in one list$"):
         call([folder / NAMES[0], counts], exposure_s=EXPOSURE_S)
-    with pytest.raises(TypeError, match="^photons_e: expected keywords among exposure_s, kind, .*overscan$"):
+    with pytest.raises(TypeError, match="^photons_e: expected keywords among exposure_s, kind, .*hdu$"):
         call(folder, photons_e=3.0)
     with pytest.raises(TypeError, match="^roi: expected keywords among exposure_s, .*assumed$"):
         call(counts, exposure_s=EXPOSURE_S, roi=None)

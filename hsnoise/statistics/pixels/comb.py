@@ -16,6 +16,7 @@ MOST_CODES = 8192
 FEWEST_PER_CODE = 100.0
 FEWEST_PERIODS = 2  # in each half of the codes
 FEWEST_LEFT = 3  # degrees of freedom of a half, which say how well the law is smooth
+MOST_WORSE = 0.2  # of the nats that exposures gain by the pattern of the others: what some may lose
 MOST_LEFT = 0.3  # of the roughness of histograms beyond chance
 KNOTS, MOST_KNOTS = 1.5, 24  # periods between two knots of the smooth law, and how many it has in a half
 DEGREE = 3
@@ -138,6 +139,17 @@ def _predicted(information: np.ndarray, score: np.ndarray) -> np.ndarray:
     return (np.sum(pattern * score, -1) - np.einsum("...i,...ij,...j", pattern, information, pattern) / 2).sum(0)
 
 
+def _is_of_some(pairs: Sequence[tuple[_Half, _Half]]) -> bool:
+    """Whether only some exposures have the pattern: that of the others makes their prediction worse."""
+    if len(pairs) < 2:
+        return False
+    information = np.array([pair[0].information + pair[1].information for pair in pairs])
+    score = np.array([pair[0].score + pair[1].score for pair in pairs])
+    pattern = _solved(information.sum(0) - information, score.sum(0) - score)
+    nats = np.sum(pattern * score, -1) - np.einsum("ni,nij,nj->n", pattern, information, pattern) / 2
+    return bool(-nats[nats < 0].sum() > MOST_WORSE * nats[nats > 0].sum())
+
+
 def _is_of_another_period(pairs: Sequence[tuple[_Half, _Half]], period: int) -> bool:
     """Whether a sinusoid of some period predicts better: single electrons or a digital gain are no pattern of codes."""
     narrow = sorted(pairs, key=lambda pair: len(pair[0].codes))[:MOST_OF_ANY]
@@ -167,12 +179,12 @@ def _solved(information: np.ndarray, score: np.ndarray) -> np.ndarray:
 
 
 def _comb(histograms: Sequence[Histogram], period: int) -> Comb | None:
-    """The pattern of this period; None if it leaves codes out, hardly explains the roughness, or another is nearer."""
+    """The pattern of this period; None if it leaves codes out, hardly explains roughness, or is not that of all."""
     pairs = [of for one in histograms if (of := _halves(one, period)) is not None]
     halves = [half for pair in pairs for half in pair]
     before = sum(half.chi2 + half.score @ _solved(half.information, half.score) for half in halves)
     rough = before / sum(half.dof + period - 1 for half in halves) - 1
-    if _worse(pairs) - 1 > MOST_LEFT * rough or _is_of_another_period(pairs, period):
+    if _worse(pairs) - 1 > MOST_LEFT * rough or _is_of_some(pairs) or _is_of_another_period(pairs, period):
         return None
     information = sum(half.information for half in halves)
     covariance = np.linalg.pinv(information, 1e-6, hermitian=True) * _worse(pairs)
