@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import hsnoise
 from hsnoise.statistics.pixels.population import _fitted, growth_cdf
 
 HEAVY = (20.0, 0.2, 0.02, 300.0, 1.2)
@@ -39,3 +40,23 @@ def test_population_is_recovered_whatever_the_noise(noise, truth):
     assert np.all(np.abs(pulls) < 4), (values, errors)
     assert np.all(errors[there] < 0.2 * np.array(truth)[there])
     assert np.all(values[~there] == 0)
+
+
+def test_hot_pixels_of_repeated_darks_beside_a_single_longer_one():
+    """Their charge is that of the repeated exposure: over the longest one, they came out ten times too slow."""
+    rng, shape, frames = np.random.default_rng(6), (128, 192), 8
+    rate = np.where(rng.random(shape) < 0.01, rng.exponential(40.0, shape), 0.0)
+    offset, response = rng.normal(0, 1, shape), 1 + 0.01 * rng.standard_normal(shape)
+
+    def counts(n, electrons):
+        read = 5 * rng.standard_normal((n, *shape))
+        return np.rint(500 + 0.5 * (rng.poisson(np.broadcast_to(electrons, (n, *shape))) + read + offset)).astype("u2")
+
+    stack = hsnoise.FrameStack(
+        [counts(frames, rate), counts(1, 10 * rate), *(counts(6, light * response) for light in (2000, 8000))],
+        [1.0, 10.0, 0.1, 0.4],
+        kind=["dark", "dark", "flat", "flat"],
+    )
+    fit = hsnoise.fit(stack)
+    share, value, error = fit.table["hot_pixels.fraction"][0], *fit.table["hot_pixels.rate"][:2]
+    assert abs(share * value - rate.mean()) < 0.15 * rate.mean() and error < 0.3 * value

@@ -31,11 +31,9 @@ def offset_of(found: Survey, c: int, population: Population | None) -> tuple[flo
     if across is not None and sigma**2 - across[0] > NOT_SHARED * np.hypot(across[1], 2 * sigma * error):
         return root_of(*across)
     by_waves = _by_waves(found, c)
-    return (
-        (sigma, error)
-        if by_waves == 0 or not np.isfinite(error)
-        else (sigma, float(np.hypot(error, min(by_waves / max(2 * sigma, 1e-12), np.sqrt(by_waves)))))
-    )
+    if by_waves > 0 and np.isfinite(error):
+        error = float(np.hypot(error, min(by_waves / max(2 * sigma, 1e-12), np.sqrt(by_waves))))
+    return sigma, error
 
 
 def _by_waves(found: Survey, c: int) -> float:
