@@ -90,7 +90,8 @@ def waves_of(spectra: Sequence[Spectrum]) -> tuple[Wave, ...]:
     slow = _is_slow(np.fft.fftfreq(rows), rows, cell)[:, None] | _is_slow(np.fft.rfftfreq(columns), columns, cell)
     seen = np.where(slow, 0.0, power)
     floor, free, found = float(np.median(power)), seen > 0, []
-    sharp = max(SHARP, _by_chance(int((weights - 1).sum()), power.size))
+    chance = _by_chance(int((weights - 1).sum()), power.size)
+    sharp = max(SHARP, chance)
     while len(found) < MOST_WAVES:
         r, c = (int(i) for i in np.unravel_index(int(np.where(free, seen, 0.0).argmax()), seen.shape))
         around = max(_beside(seen[:, c], r, wraps=True), _beside(seen[r], c, wraps=False))
@@ -106,7 +107,7 @@ def waves_of(spectra: Sequence[Spectrum]) -> tuple[Wave, ...]:
         free[(r + beside[:, None]) % rows, of_columns] = False
         if c + NEAR >= free.shape[1]:  # of half a cycle per column, the mirror image is the same wave
             free[(beside[:, None] - r) % rows, of_columns] = False
-        sharp = max(SHARP_BESIDE, _by_chance(int((weights - 1).sum()), power.size))
+        sharp = max(SHARP_BESIDE, chance)
     return tuple(found)
 
 
