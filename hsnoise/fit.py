@@ -33,13 +33,13 @@ from hsnoise.likelihood.summary import Summary, far_outliers, summarise
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_effects, check_fits
 from hsnoise.simulation.portion import Portion
+from hsnoise.statistics.pixels.probe import all_of, surveyed
 from hsnoise.statistics.pixels.structure import can_be_transferred, pixels_differ, rows_dominate
-from hsnoise.statistics.pixels.survey import Survey, survey
+from hsnoise.statistics.pixels.survey import Survey
 
 log = logging.getLogger(__name__)
 
 OUTLIERS_FROM = 1e-4
-PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure, to test whether pixels differ
 SMALLEST = 8  # rows and columns; fewer say nothing about rows
 METHODS = ("auto", "ml", "line", "transfer")
 PIXELS = ("auto", "alike", "differ")
@@ -112,8 +112,10 @@ def fit(
     if model is not None:
         check_fits(model, source, "model")  # before the frames are read
         check_named(model)
+    if not isinstance(source, Summary):
+        _check_size(source)
     extra = () if model is None else without_likelihood(model)
-    found = None if isinstance(source, Summary) or "dark" not in source.kind else _surveyed(source)
+    found = None if isinstance(source, Summary) or "dark" not in source.kind else surveyed(source)
     measurable = found is not None and (model is None or "black_clamp" not in model)
     differ = measurable and _is_conditional(found, method, pixels)
     seen = None
@@ -133,7 +135,7 @@ def fit(
     summary = seen.summary
     if differ or measurable and pixels == "auto" and carries_no_gain(seen, method):
         log.info("Following each pixel over time: %s", "pixels differ" if differ else "pooled, they show no gain")
-        return _ended(checked(result_of(seen.measured(_all_of(source, found)), summary, model, source), seen))
+        return _ended(checked(result_of(seen.measured(all_of(source, found)), summary, model, source), seen))
     result = replace(_pooled(summary, model, method), stack=source)
     return _ended(checked(confirmed(result, seen, model) if pixels == "auto" and method != "line" else result, seen))
 
@@ -211,24 +213,7 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
 
 def rechecked(result: FitResult, stack) -> FitResult:
     """The result with the doubts of its own model, instead of those of the fit that it started from."""
-    return checked(result, Evidence(_surveyed(stack), result.summary))
-
-
-def _surveyed(stack) -> Survey:
-    """A survey of the stack, or of part of a large one: enough to see whether pixels differ."""
-    _check_size(stack)
-    rows, columns = stack.shape
-    frames = slice(0, PROBE_FRAMES)
-    if rows * columns <= PROBE_PIXELS:
-        return survey(stack if max(stack.n_frames) <= PROBE_FRAMES else stack.select(frames=frames))
-    kept = max(PROBE_PIXELS // columns // 4 * 4, 32)
-    first = max((rows - kept) // 8 * 4, 0)
-    return survey(stack.select(rows=(first, min(first + kept, rows)), frames=frames))
-
-
-def _all_of(stack, found: Survey) -> Survey:
-    """The survey of the whole stack; `found` if that already covers it."""
-    return found if found.shape == stack.shape and max(stack.n_frames) <= PROBE_FRAMES else survey(stack)
+    return checked(result, Evidence(surveyed(stack), result.summary))
 
 
 def _is_conditional(found: Survey, method: str, pixels: str) -> bool:
@@ -250,7 +235,6 @@ def _check_size(stack) -> None:
 
 
 def _summary_of(stack, progress) -> Summary:
-    _check_size(stack)
     log.info("Reading %d frames of %d x %d pixels", sum(stack.n_frames), *stack.shape)
     if stack.cfa == "mono":
         warn_of_a_mosaic(stack.frame(int(np.argmax(stack.exposure_s)), 0))

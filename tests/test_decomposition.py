@@ -82,3 +82,13 @@ def test_two_halves_of_the_frames_share_the_pattern_alone(frames, lines_off):
         found.append(covariance_of(*lines_off(level, shape[0]).astype(np.float64)))
     bias, error = np.mean(found) / sigma**2 - 1, np.std(found) / sigma**2 / np.sqrt(len(found))
     assert abs(bias) < 3 * error + 0.001
+
+
+@pytest.mark.parametrize("split", [0, 1, 3])
+def test_sums_of_some_frames_and_later_ones_are_those_of_all(split):
+    counts = np.random.default_rng(4).integers(100, 2000, (5, 30, 40)) * np.arange(1, 6)[:, None, None]
+    whole, parts = summed(counts), summed(counts[:split]).followed_by(summed(counts[split:]))
+    np.testing.assert_array_equal(parts.pixel, whole.pixel)
+    np.testing.assert_array_equal(parts.rows, whole.rows)
+    np.testing.assert_array_equal(parts.columns, whole.columns)
+    assert (parts.squares, parts.reference, parts.n_frames) == (whole.squares, whole.reference, 5)

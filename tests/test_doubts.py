@@ -9,9 +9,9 @@ import pytest
 
 import hsnoise
 from hsnoise._core.conclusion import Light
-from hsnoise.fit import _surveyed
 from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts.checks import Evidence, checked
+from hsnoise.statistics.pixels.probe import surveyed
 
 EXPOSURES_S, FRAMES, SHAPE = (0.1, 0.4, 1.6), 6, (96, 128)
 GAIN, BLACK, READ_E = 2.0, 100.0, 4.0
@@ -51,7 +51,7 @@ def test_a_right_fit_raises_no_doubt(good):
 )
 def test_a_parameter_that_is_wrong_is_seen_in_the_drawn_frames(good, where, value, says):
     broken = replace(good, params=eqx.tree_at(where, good.params, jax.numpy.full_like(where(good.params), value)))
-    found = _surveyed(good.stack)
+    found = surveyed(good.stack)
     sentences = list(disagreements(broken, found))
     assert any(says in sentence for sentence in sentences), sentences
     assert not checked(broken, Evidence(found, good.summary)).trustworthy
@@ -95,7 +95,7 @@ def test_rows_that_go_on_contradict_a_global_shutter(coloured, shutter, doubted)
 
 
 def test_frames_that_were_smoothed_are_named(good):
-    assert all(abs(plane.neighbours_share) < 0.03 for group in _surveyed(good.stack).groups for plane in group.planes)
+    assert all(abs(plane.neighbours_share) < 0.03 for group in surveyed(good.stack).groups for plane in group.planes)
     counts = pixels_that_differ().astype(float)
     fit = hsnoise.fit(np.round((counts + np.roll(counts, 1, 3)) / 2).astype(np.uint16), exposure_s=EXPOSURES_S)
     assert any("smoothed, denoised" in doubt for doubt in fit.doubts), fit.doubts

@@ -12,7 +12,7 @@ import numpy as np
 from hsnoise._core.arguments import listed, not_negative, numbers, one_of, positive
 from hsnoise._core.naming import named, setting
 from hsnoise._core.types import StatedGain
-from hsnoise.frames.lazy import LazyFrames
+from hsnoise.frames.lazy import LazyFrames, is_dask
 
 KINDS = ("dark", "flat")
 
@@ -47,8 +47,8 @@ def exposure_groups(counts: Any) -> tuple[Any, ...]:
         array = _as_array(counts)
         if len(array.shape) != 4:
             groups = (array,)
-        elif isinstance(array, np.ndarray):
-            groups = tuple(array)
+        elif isinstance(array, np.ndarray) or is_dask(array):
+            groups = tuple(array[i] for i in range(array.shape[0]))
         else:
             groups = tuple(_lazy_exposure(array, i) for i in range(array.shape[0]))
     if not groups:

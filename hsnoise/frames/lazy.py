@@ -63,10 +63,14 @@ class LazyFrames:
         return f"LazyFrames(shape={self.shape}, dtype={self.dtype})"
 
 
+def is_dask(counts: Any) -> bool:
+    return hasattr(counts, "__dask_graph__")
+
+
 def crop(counts: Any, rows: slice, columns: slice, *, frames: slice | None = None) -> Any:
     """Region of frames `[frame, row, column]` in stored orientation; reads and copies nothing."""
     chosen = slice(None) if frames is None else frames
-    if isinstance(counts, np.ndarray):
+    if isinstance(counts, np.ndarray) or is_dask(counts):
         return counts[chosen, rows, columns]
     indices = range(counts.shape[0])[chosen]
     readers = [partial(_read_region, counts, i, rows, columns) for i in indices]

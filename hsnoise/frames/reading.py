@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -55,12 +55,3 @@ def while_reading(name: str) -> Iterator[None]:
             f"{name}: lost the cluster that was reading this frame or some after it ({type(error).__name__});"
             " start it again, and run this once more"
         ) from error
-
-
-def is_dask(counts: Any) -> bool:
-    return hasattr(counts, "__dask_graph__")
-
-
-def checked(frame: np.ndarray, name: str, white_level: float | None, row_axis: int, function: Callable) -> Any:
-    check_values(frame, white_level=white_level, name=name)
-    return function(in_sensor_orientation(frame, row_axis))

@@ -28,9 +28,8 @@ from hsnoise.frames.checks import check_black_level
 from hsnoise.frames.describing import COLUMNS, as_html, described, groups_of
 from hsnoise.frames.joining import joined, replaced
 from hsnoise.frames.lazy import crop, read_mapped
-from hsnoise.frames.reading import check_frame, checked, frame_name, in_sensor_orientation, is_dask, while_reading
-
-BATCH = 64  # frames of a Dask array passed to its scheduler at a time
+from hsnoise.frames.passes import Kept, fold_frames, map_frames, whole_frames
+from hsnoise.frames.reading import check_frame, frame_name, in_sensor_orientation, while_reading
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -188,8 +187,8 @@ class FrameStack:
         return in_sensor_orientation(frame, self.row_axis)
 
     def frames(self, exposure: int) -> Iterator[np.ndarray]:
-        """The frames of one exposure group in order, one in memory at a time; see `frame`."""
-        return (self.frame(exposure, number) for number in range(self.n_frames[exposure]))
+        """The frames of one exposure group in order, one in memory at a time (of a Dask array, some); see `frame`."""
+        return whole_frames(self, exposure)
 
     def map_frames(
         self,
@@ -203,25 +202,22 @@ class FrameStack:
         Frames of a Dask array are read, checked and reduced where its scheduler runs, such as on a cluster's workers;
         results come back, some as one if `combine` adds two up. Lost tasks run again; RuntimeError if all workers are.
         """
-        counts, chosen = self.counts[exposure], range(self.n_frames[exposure]) if chosen is None else chosen
-        if not is_dask(counts):
-            yield from (function(self.frame(exposure, number)) for number in chosen)
-            return
-        import dask  # only needed for Dask arrays
+        return map_frames(self, exposure, function, combine, chosen)
 
-        for start in range(0, len(chosen), BATCH):
-            numbers = chosen[start : start + BATCH]
-            names = [frame_name(self, exposure, number) for number in numbers]
-            tasks = [
-                dask.delayed(checked)(counts[number], name, self.white_level, self.row_axis, function)
-                for number, name in zip(numbers, names, strict=True)
-            ]
-            while combine is not None and len(tasks) > 1:
-                pairs = zip(tasks[::2], tasks[1::2], strict=False)
-                tasks = [dask.delayed(combine)(*pair) for pair in pairs] + tasks[len(tasks) // 2 * 2 :]
-            with while_reading(names[0]):
-                results = dask.compute(*tasks)
-            yield from results
+    def fold_frames(
+        self,
+        exposure: int,
+        start: Callable[[], Kept],
+        add: Callable[[Kept, np.ndarray, int], Kept],
+        merge: Callable[[Kept, Kept], Kept],
+        tick: Callable[[], object] = lambda: None,
+    ) -> Kept:
+        """One total of all frames of an exposure group: `add(total, frame, number)` for each in order, from `start()`.
+
+        Frames of a Dask array have totals of their own where they are read, and `merge`, which changes neither of its
+        arguments, adds up those of earlier and later frames. `tick` is called for each frame.
+        """
+        return fold_frames(self, exposure, start, add, merge, tick)
 
     def with_counts(self, counts: Sequence[np.ndarray], window: Window | None) -> FrameStack:
         """A stack of other `counts`, one array per exposure in sensor orientation, taken under the same conditions.

@@ -295,7 +295,8 @@ def far_outliers(summary: Summary) -> np.ndarray:
 def _codings(stack: FrameStack, group: int) -> dict[str, tuple[int, int, int]]:
     """`_coding` of each channel of an exposure, from its first and last frame."""
     numbers = sorted({0, stack.n_frames[group] - 1})
-    thin = [_some_rows(stack.frame(group, n), len(cfa_tile(stack.cfa)), len(numbers)) for n in numbers]
+    some = partial(_some_rows, step=len(cfa_tile(stack.cfa)), frames=len(numbers))
+    thin = list(stack.map_frames(group, some, chosen=numbers))
     samples = (np.stack([channel_rows(rows, stack.cfa, c) for rows in thin]) for c in stack.channels)
     return {c: _coding(sample, stack.white_level) for c, sample in zip(stack.channels, samples, strict=True)}
 

@@ -76,6 +76,20 @@ class PlaneSums:
         self.rows.append(rows)
         self.columns.append(columns)
 
+    def followed_by(self, later: PlaneSums) -> PlaneSums:
+        """The sums of these frames and of `later` ones, exactly those of adding all to one."""
+        if self.reference is None or later.reference is None:
+            return later if self.reference is None else self
+        total, (h, w) = PlaneSums(self.shape), self.shape
+        shift = later.reference - self.reference
+        total.reference = self.reference
+        total.pixel = self.pixel + later.pixel + np.int32(shift * later.n_frames)
+        total.rows = self.rows + [rows + shift * w for rows in later.rows]
+        total.columns = self.columns + [columns + shift * h for columns in later.columns]
+        of_later = 2 * shift * sum(float(rows.sum()) for rows in later.rows) + shift**2 * later.n_frames * h * w
+        total.squares = self.squares + later.squares + of_later
+        return total
+
     @property
     def n_frames(self) -> int:
         return len(self.rows)

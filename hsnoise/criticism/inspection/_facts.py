@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hsnoise.frames.io._overscan import Strip, find, without
-from hsnoise.frames.lazy import LazyFrames
+from hsnoise.frames.lazy import LazyFrames, is_dask
 from hsnoise.frames.mosaics import looks_like_a_mosaic
 from hsnoise.frames.stack import FrameStack
 
@@ -141,40 +143,58 @@ def _group(
 ) -> tuple[GroupFacts | None, np.ndarray, list[str]]:
     """Facts of one group, its region [frame, row, column], and why frames cannot be used."""
 
-    def read(number: int) -> tuple[np.ndarray, dict[str, Any]] | str:
-        try:
-            frame = stack.frame(i, number)
-        except (ValueError, OSError) as error:
-            return str(error)
-        return frame[parts.kept].copy(), _of_frame(frame, stack, i, number, parts)
-
     good, broken = [], []
-    with ThreadPoolExecutor(READERS) as pool:
-        for one in pool.map(read, range(stack.n_frames[i])):
-            (broken if isinstance(one, str) else good).append(one)
-            tick()
+    for number, one in enumerate(_looked_at(stack, i, partial(_seen, parts=parts, white_level=stack.white_level))):
+        if isinstance(one, str):
+            broken.append(one)
+        else:
+            good.append((one[0], {**one[1], **_named(stack, i, number)}))
+        tick()
     if not good:
         return None, np.zeros((0, 0, 0)), broken
     counts = np.stack([region for region, _ in good])
     return _of_group(stack, i, counts, [facts for _, facts in good]), counts, broken
 
 
-def _of_frame(frame: np.ndarray, stack: FrameStack, i: int, number: int, parts: _Parts) -> dict[str, Any]:
-    """Facts of a whole frame [row, column]; shares are those of all pixels but overscan."""
-    counts, lit = stack.counts[i], frame[parts.lit]
+def _looked_at(stack: FrameStack, i: int, look: Callable[[np.ndarray], Any]) -> Iterator[Any]:
+    """`look` at each frame of a group, or why it cannot be read."""
+
+    def alone(number: int) -> Any:
+        try:
+            return next(stack.map_frames(i, look, chosen=[number]))
+        except (ValueError, OSError) as error:
+            return str(error)
+
+    if is_dask(stack.counts[i]):
+        with suppress(ValueError, OSError):  # those of which frame, is found frame by frame
+            yield from list(stack.map_frames(i, look))
+            return
+    with ThreadPoolExecutor(READERS) as pool:
+        yield from pool.map(alone, range(stack.n_frames[i]))
+
+
+def _seen(frame: np.ndarray, parts: _Parts, white_level: float | None) -> tuple[np.ndarray, dict[str, Any]]:
+    """The region that is kept, and facts of a whole frame [row, column]; shares are those of all but overscan."""
+    lit = frame[parts.lit]
     highest = int(lit.max())
-    white = highest + 1 if stack.white_level is None else stack.white_level
+    white = highest + 1 if white_level is None else white_level
     overscan = [strip.pixels(frame).mean() for strip in parts.strips]
-    return {
-        "name": Path(counts.names[number]).name if isinstance(counts, LazyFrames) else f"frame {number}",
+    return frame[parts.kept].copy(), {
         "clipped_share": float(np.mean(lit == 0)),
         "saturated_share": float(np.mean(lit >= white)),
         "highest_dn": highest,
         "highest_share": float(np.mean(lit == highest)),
         "overscan_dn": float(np.mean(overscan)) if overscan else float("nan"),
         "fingerprint": hashlib.blake2b(frame).digest(),
-        "taken": counts.taken[number] if isinstance(counts, LazyFrames) else None,
     }
+
+
+def _named(stack: FrameStack, i: int, number: int) -> dict[str, Any]:
+    """The name of a frame and when it was taken."""
+    counts = stack.counts[i]
+    if isinstance(counts, LazyFrames):
+        return {"name": Path(counts.names[number]).name, "taken": counts.taken[number]}
+    return {"name": f"frame {number}", "taken": None}
 
 
 def _of_group(stack: FrameStack, i: int, counts: np.ndarray, facts: list[dict[str, Any]]) -> GroupFacts:

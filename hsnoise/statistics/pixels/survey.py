@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +16,11 @@ from hsnoise.statistics.narrow_noise import narrow_read_noise
 from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_of
+from hsnoise.statistics.pixels.look import Look, OddLines
 from hsnoise.statistics.pixels.register import Register, register_of
-from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, row_means, shortest_repeated
+from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
-from hsnoise.statistics.pixels.waves import MOST_FRAMES, Spectrum, Wave, middle_of_frame, spectrum_of, waves_of
+from hsnoise.statistics.pixels.waves import Spectrum, Wave, spectrum_of, waves_of
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
 FEWEST_STILL = 4  # frames
@@ -59,22 +59,6 @@ class Plane:
     blocks_dn: np.ndarray | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
-
-
-class OddLines(NamedTuple):
-    """Numbers of the rows and columns in a group's first frame that are not measurements."""
-
-    constant_rows: np.ndarray
-    constant_columns: np.ndarray
-    repeated_rows: np.ndarray
-
-    @staticmethod
-    def of(frame: np.ndarray, step: int) -> OddLines:
-        """Rows and columns with a single count, and rows that repeat the previous row of the same colours."""
-        rows, columns = np.ptp(frame, axis=1) == 0, np.ptp(frame, axis=0) == 0
-        repeated = np.zeros(len(frame), bool)
-        repeated[step:] = (frame[step:] == frame[:-step]).all(1) & ~rows[step:]
-        return OddLines(*(np.flatnonzero(x) for x in (rows, columns, repeated)))
 
 
 @dataclass(frozen=True)
@@ -239,49 +223,34 @@ def _group(
 ) -> tuple[Group, int, int]:
     """A group, its highest count, and the largest number of which the counts of its first frame are multiples."""
     tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
-    step, channels = len(tile), len(stack.channels)
-    sums = [PlaneSums((stack.shape[0] // step, stack.shape[1] // step)) for _ in range(step * step)]
-    kept: np.ndarray | None = None
-    odd: OddLines | None = None
-    means: list[np.ndarray] = []
-    middles: list[np.ndarray] = []
-    clipped, saturated, pixels, highest = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
-    for f, frame in enumerate(stack.frames(i)):
-        if kept is None:
-            kept = np.empty((n, len(rows), frame.shape[1]), frame.dtype)
-            odd = OddLines.of(frame, step)
-        kept[f] = frame[rows]
-        means += [row_means(frame)] if looks_for_row_groups else []
-        middles += [middle_of_frame(frame)] if stack.kind[i] == "dark" and f < MOST_FRAMES else []
-        white = np.inf if stack.white_level is None else stack.white_level
-        for p in range(step * step):
-            plane, c = frame[p // step :: step, p % step :: step], tile[p // step, p % step]
-            sums[p].add(plane)
-            clipped[c] += np.count_nonzero(plane == 0)
-            saturated[c] += np.count_nonzero(plane >= white)
-            pixels[c] += plane.size
-        highest = max(highest, int(frame.max()))
-        tick()
-    assert kept is not None and odd is not None  # FrameStack has no empty groups
+    step = len(tile)
+    look = Look(
+        stack.cfa, stack.shape, rows, stack.white_level, looks_for_row_groups, looks_for_waves=stack.kind[i] == "dark"
+    )
+    seen = stack.fold_frames(i, look.start, look.add, look.merge, tick)
+    assert seen.odd is not None  # FrameStack has no empty groups
+    kept, pixels = np.stack(seen.kept), n * np.bincount(tile.ravel()) * seen.sums[0].pixel.size
     half = int(np.searchsorted(rows[::step], stack.shape[0] / 2)) if looks_for_row_groups else None
     planes = tuple(
-        _plane(sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
+        _plane(seen.sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
         for p in range(step**2)
     )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
-    groups = row_groups_of(np.stack(means), first_row, planes[0].banding.get("row")) if means else None
-    spectrum = spectrum_of(middles, step)
+    banding, means = planes[0].banding.get("row"), seen.row_means
+    groups = row_groups_of(np.stack(means), first_row, banding) if means else None
+    spectrum = spectrum_of(seen.middles, step)
     of_frames = (
         along_rows(kept, step, rows, waves_of([] if spectrum is None else [spectrum])),
         groups,
         register_of(kept) if step == 1 and stack.kind[i] == "dark" else None,
         spectrum,
-        histogram_of(kept, white),
+        histogram_of(kept, np.inf if stack.white_level is None else stack.white_level),
         tuple(Path(name).name for name in getattr(stack.counts[i], "names", ())),
     )
     of_codes = int(np.gcd.reduce(kept[0].ravel()[:: max(1, kept[0].size // MOST_CODES)].astype(np.int64)))
-    return Group(*conditions, clipped / pixels, saturated / pixels, odd, planes, *of_frames), highest, of_codes
+    shares = seen.clipped / pixels, seen.saturated / pixels
+    return Group(*conditions, *shares, seen.odd, planes, *of_frames), seen.highest, of_codes
 
 
 def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int, half: int | None) -> Plane:
