@@ -12,16 +12,16 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 import hsnoise
+from hsnoise._core.sheet import Sheet
 
 EXPOSURE_S = (0.02, 0.1, 0.5, 2.0)
 CAPTURE: dict[str, Any] = {"black_level": 100, "white_level": 4095, "cfa": "mono", "shutter": "global"}
@@ -29,17 +29,29 @@ JOBS = ("fit", "budget", "inspect", "compare")
 GAIN_DN, READ_NOISE_DN, DARK_CURRENT_E = 2.0, 4.0, 15.0
 
 
+@lru_cache(maxsize=1)
+def pixels(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Dark current, e-/s, and offset, DN, of each pixel."""
+    rng = np.random.default_rng(0)
+    rate_e = (DARK_CURRENT_E / 4) * rng.standard_gamma(4.0, shape, np.float32)
+    return rate_e, 2 * rng.standard_normal(shape, np.float32)
+
+
+def frame(exposure: int, number: int, shape: tuple[int, int], exposure_s: float) -> np.ndarray:
+    """Counts [row, column] of a camera whose pixels differ; shot noise is normal, which is faster."""
+    rate_e, offset_dn = pixels(shape)
+    signal_e = rate_e * np.float32(exposure_s)
+    noise = np.random.default_rng([1, exposure, number]).standard_normal(shape, np.float32)
+    counts = 100 + offset_dn + GAIN_DN * signal_e + np.sqrt(READ_NOISE_DN**2 + GAIN_DN**2 * signal_e) * noise
+    return np.clip(np.rint(counts), 0, 4095).astype(np.uint16)
+
+
 def read(exposure: int, number: int, shape: tuple[int, int], read_s: float, log: Path) -> np.ndarray:
-    """A frame [exposure, frame, row, column] of a camera; a byte in `log` tells that it was read."""
+    """A frame as a block [exposure, frame, row, column]; a byte in `log` tells that it was read."""
     time.sleep(read_s)
     with (log / f"{exposure}_{number}").open("ab") as file:
         file.write(b".")
-    pixels = np.random.default_rng(0)
-    signal_e = pixels.gamma(4.0, DARK_CURRENT_E / 4, shape).astype(np.float32) * EXPOSURE_S[exposure]
-    offset_dn = 2 * pixels.standard_normal(shape, np.float32)
-    noise = np.random.default_rng([1, exposure, number]).standard_normal(shape, np.float32)
-    counts = 100 + offset_dn + GAIN_DN * signal_e + np.sqrt(READ_NOISE_DN**2 + GAIN_DN**2 * signal_e) * noise
-    return np.clip(np.rint(counts), 0, 4095).astype(np.uint16)[None, None]
+    return frame(exposure, number, shape, EXPOSURE_S[exposure])[None, None]
 
 
 def frames_of(frames: int, shape: tuple[int, int], read_s: float, log: Path) -> Any:
@@ -78,7 +90,7 @@ def main() -> None:
     rows, columns = (int(n) for n in arguments.shape.split("x"))
     from distributed import Client, LocalCluster
 
-    table = Table("job", "workers", "time / s", "frames read once, twice, more", "mean")
+    sheet = Sheet("Frames read on a cluster", ("job", "workers", "time / s", "read once, twice, more", "mean"))
     jobs, model = arguments.only.split(","), None
     total = len(EXPOSURE_S) * arguments.frames
     for workers in (int(n) for n in arguments.workers.split(",")):
@@ -94,12 +106,11 @@ def main() -> None:
                 found, took_s, reads = timed(name, counts, model, Path(folder))
                 several = sum(n for times, n in reads.items() if times > 2)
                 mean = sum(times * n for times, n in reads.items()) / total
-                table.add_row(
-                    name, str(workers), f"{took_s:.1f}", f"{reads[1]}, {reads[2]}, {several} of {total}", f"{mean:.2f}"
-                )
+                of_frames = f"{reads[1]}, {reads[2]}, {several} of {total}"
+                sheet.rows.append((name, str(workers), f"{took_s:.1f}", of_frames, f"{mean:.2f}"))
                 if name == "fit":
                     Console().print(str(found.conclusion), markup=False)
-    Console().print(table)
+    Console().print(sheet.rich())
 
 
 if __name__ == "__main__":

@@ -102,3 +102,16 @@ def test_defects_and_saturated_levels_change_neither_the_fit_nor_the_verdict(rng
     assert not ((flags & FLAGS["stuck"] > 0) & (flags & FLAGS["dead"] > 0)).any()  # one count in light and dark
     found = hsnoise.compare(fit, stack)
     assert found.error < 4 and any("stuck or dead" in sentence for sentence in found.skipped)
+
+
+def test_many_frames_make_no_telegraph_pixels_of_pixels_that_differ():
+    """The variance of pixels of one level differs visibly in 300 frames: by their offsets, and their noise by 10 %."""
+    rng = np.random.default_rng(8)
+    shape = (32, 48)
+    signal, offset = rng.gamma(4, 5, shape), rng.normal(100, 2, shape)
+    sigma = np.sqrt((4 * np.exp(rng.normal(0, 0.1, shape))) ** 2 + 4 * signal)
+    counts = np.rint(offset + 2 * signal + sigma * rng.standard_normal((300, *shape))).astype(np.uint16)
+    jumping = slice(0, 20)
+    counts[:, 0, jumping] += (40 * (rng.random((300, 20)) < 0.3)).astype(np.uint16)
+    found = flags_of(survey(hsnoise.FrameStack(counts, 1.0)), 0).reshape(shape) & FLAGS["telegraph"] > 0
+    assert found[0, jumping].all() and found.sum() == 20

@@ -14,6 +14,7 @@ DIM = 0.5  # of the median response of its neighbours: below it a pixel is dead
 LIT_SIGMAS = 5.0  # a signal below this, in units of a level's noise, is no light
 FEWEST = 20  # pixels of a class
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
+NOISIER = 2.0  # times the variance of others of its level, at least: many frames show any small difference
 
 
 def flags_of(found: Survey, channel: int) -> np.ndarray:
@@ -76,7 +77,7 @@ def _jumping(groups: tuple[Group, ...], channel: int, pixels: int) -> np.ndarray
             continue
         level = group.pixels(channel, "level_dn").mean(0)
         expected = _of_their_level(level, group.pixels(channel, "pair_variance_dn2"))
-        limit = chi2.isf(RARE, dof) / dof
+        limit = np.maximum(chi2.isf(RARE, dof) / dof, NOISIER)
         found |= (group.pixels(channel, "variance_dn2") / np.maximum(expected, 0.25) > limit[:, None]).all(0)
     return found
 
