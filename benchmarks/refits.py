@@ -38,7 +38,7 @@ OF_THE_LOOP = EFFECTS | {
     "row_fixed_pattern": fx.RowFixedPattern(1.0),
     "heavy_tailed_read_noise": fx.HeavyTailedReadNoise(6.0),
     "read_noise_nonuniformity": fx.ReadNoiseNonuniformity(0.2),
-    "correlated_read_noise": fx.CorrelatedReadNoise(0.3),
+    "correlated_read_noise": fx.CorrelatedReadNoise(0.3, 0.25, 0.5),
 }
 EXPOSURE_S, FRAMES, SHAPE = (0.02, 0.05, 0.1, 0.2), 6, (64, 96)
 WITHIN = 1.96
