@@ -52,7 +52,7 @@ def textbook(stack: hsnoise.FrameStack) -> hsnoise.NoiseModel:
     moments = [(f.mean(), f.var(), stack.exposure_s[i]) for i in groups for f in [stack.frame(i, 0).astype(float)]]
     mean, variance, exposure_s = np.array(sorted(moments, key=lambda one: one[2])).T
     slope = np.polyfit(mean, variance, 1)[0] if np.ptp(mean) > 0 else np.nan
-    gain = float(slope) if np.isfinite(slope) and slope > 0 else 1.0
+    gain = float(slope) if np.isfinite(slope) and slope > 0 else 1.0  # darks that do not grow: in DN
     rate = float(max(mean[-1] - mean[0], 0.0) / gain / max(exposure_s[-1] - exposure_s[0], 1e-9))
     parts = [fx.DarkCurrent(rate), fx.ReadNoise(float(np.sqrt(variance[0])) / gain), fx.Gain(gain)]
     black = fx.BlackLevel(float(mean[0] - rate * exposure_s[0] * gain))
@@ -83,6 +83,7 @@ def told(name: str, stack: hsnoise.FrameStack, out: Path) -> tuple[str, ...]:
         *left_of(found, closed),
     ]
     (out / f"{name}.md").write_text("\n".join(lines) + "\n")
+    fit.params.save(out / f"{name}.json")
     draw(fit.params, stack).savefig(out / f"{name.lower()}.png", dpi=100)
     errors = (f"{one:.3g}" for one in (plain.error, found.error, closed.comparison.error))
     return (name, *errors, found.worst_group, f"{seconds:.0f} s")
@@ -138,33 +139,41 @@ def shares_of(closed: ClosedModel) -> Iterable[str]:
 
 
 def draw(model: hsnoise.NoiseModel, stack: hsnoise.FrameStack) -> Figure:
-    """A frame of the longest repeated darks and a drawn one, and the mean rows and columns of all frames."""
+    """A frame of the longest repeated darks and a drawn one, the means of all, and their means of rows and columns."""
     darks = Portion.of(stack).darks.frames
-    drawn, e = draw_capture(1, model, darks), int(np.argmax(darks.exposure_s))
-    figure = Figure(figsize=(11, 6.4), layout="constrained")
-    axes = figure.subplots(2, 2, height_ratios=[2, 1])
-    frames = [of.frame(e, 0).astype(float) for of in (darks, drawn)]
+    e = max(_repeated(darks), key=lambda i: darks.exposure_s[i])
+    counts = [np.stack(list(of.frames(e))).astype(float) for of in (darks, draw_capture(1, model, darks))]
     part = tuple(
         slice(max(size - most, 0) // 2, max(size - most, 0) // 2 + most)
         for size, most in zip(darks.shape, SHOWN, strict=True)
     )
-    low, high = np.percentile(frames[0][part], STRETCH)
-    for ax, frame, name in zip(axes[0], frames, ("measured", "drawn from the model"), strict=True):
-        ax.imshow(frame[part], cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
-        ax.set_title(f"{name}: a dark frame of {darks.exposure_s[e]:g} s", fontsize=11)
-        ax.set_xticks([])
-        ax.set_yticks([])
-    means = [np.mean(list(of.frames(e)), axis=0) for of in (darks, drawn)]
-    for ax, axis, name in ((axes[1, 0], 1, "row"), (axes[1, 1], 0, "column")):
-        for mean, ink, label in zip(means, INK, ("measured", "drawn"), strict=True):
-            line = mean.mean(axis)
+    figure = Figure(figsize=(11, 9.6), layout="constrained")
+    axes = figure.subplots(3, 2, height_ratios=[2, 2, 1])
+    for row, of, name in ((0, 0, "a frame"), (1, slice(None), f"mean of {darks.n_frames[e]} frames")):
+        shown = [one[of].reshape(-1, *darks.shape).mean(0) for one in counts]
+        shown = [one - np.median(one) for one in shown]
+        low, high = np.percentile(shown[0][part], STRETCH)
+        for ax, one, whose in zip(axes[row], shown, ("measured", "drawn from the model"), strict=True):
+            ax.imshow(one[part], cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
+            ax.set_title(f"{whose}: {name}, {low:+.1f} to {high:+.1f} DN", fontsize=11)
+            ax.set_xticks([])
+            ax.set_yticks([])
+    for ax, axis, name in ((axes[2, 0], 2, "row"), (axes[2, 1], 1, "column")):
+        for one, ink, label in zip(counts, INK, ("measured", "drawn"), strict=True):
+            line = one.mean((0, axis))
             ax.plot(line - np.median(line), color=ink, linewidth=0.9, label=label)
         ax.set_xlabel(name)
-        ax.set_ylabel(f"mean of {name}s / DN")
+        ax.set_ylabel(f"{name} mean / DN")
         ax.spines[["top", "right"]].set_visible(False)
         ax.margins(x=0)
-    axes[1, 0].legend(frameon=False)
+    figure.legend(*axes[2, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    figure.suptitle(f"Darks of {darks.exposure_s[e]:g} s", fontsize=12)
     return figure
+
+
+def _repeated(darks: hsnoise.FrameStack) -> list[int]:
+    """Exposures of two frames or more, else all."""
+    return darks.repeated_darks or list(range(darks.n_exposures))
 
 
 def main() -> None:

@@ -291,6 +291,8 @@ def damaged(content, where, value):
         (("shutter",), None, "'shutter' is missing"),
         (("effects", 1, "parameters", "rate", "unit"), "e-/ms", "dark_current.rate: expected unit 'e-/s'"),
         (("effects", 1, "parameters", "rate", "value"), -1.0, "dark_current.rate: expected finite"),
+        (("effects", 1, "parameters", "rate"), 118.0, "dark_current.rate: expected an object with value"),
+        (("effects", 1, "parameters", "rate"), {"value": 118.0}, "expected an object with value and unit"),
         (("effects", 1, "parameters"), {"rates": 1}, "dark_current: expected parameters"),
         (("effects", 6, "settings"), {"white": 1}, "white"),
     ],

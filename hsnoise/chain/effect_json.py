@@ -61,7 +61,10 @@ def effect_from_json(
         raise ValueError(f"{name}: expected parameters {sorted(specs)}, got {sorted(item['parameters'])}.")
     values = {}
     for field, spec in ((field, spec) for field, spec in specs.items() if field in given):
-        value, unit = item["parameters"][field]["value"], item["parameters"][field]["unit"]
+        one = item["parameters"][field]
+        if not isinstance(one, Mapping) or not {"value", "unit"} <= set(one):
+            raise ValueError(f"{name}.{field}: expected an object with value and unit, got {one!r:.60}.")
+        value, unit = one["value"], one["unit"]
         if unit != spec.unit:
             raise ValueError(f"{name}.{field}: expected unit {spec.unit!r}, got {unit!r}.")
         values[field] = _of_channels(value, channels, f"{name}.{field}") if spec.per_channel else value
