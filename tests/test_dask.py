@@ -118,6 +118,21 @@ def test_a_survey_of_a_dask_array_is_that_in_memory_to_the_last_bit(differing):
 
 
 @pytest.mark.slow
+def test_doubts_of_many_frames_are_those_in_memory():
+    """With 200 frames the noise of each pixel is known so well that bright ones stand out of the drawn, of eight."""
+    rng, exposures_s = np.random.default_rng(6), (0.02, 0.5, 2.0)
+    dark, offset = rng.exponential(20, (48, 64)), rng.normal(0, 4, (48, 64))
+    counts = [
+        100 + offset + 2 * (rng.poisson(dark * t, (200, 48, 64)) + rng.normal(0, 2, (200, 48, 64))) for t in exposures_s
+    ]
+    counts = np.clip(np.rint(counts), 0, 4095).astype(np.uint16)
+    known = {"exposure_s": exposures_s, "black_level": 100, "white_level": 4095, "shutter": "global"}
+    lazy, whole = (hsnoise.fit(of, **known) for of in (da.from_array(counts, chunks=(1, 50, 48, 64)), counts))
+    assert len(lazy.doubts) == len(whole.doubts) and not any("noise" in sentence for sentence in lazy.doubts)
+    assert lazy.table["gain"][0] == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("job", ["budget", "inspect", "compare", "fit"])
 def test_a_worker_that_is_lost_changes_no_result(job, differing, cluster, tmp_path):
     lazy = da.from_array(differing, chunks=(1, 1, 64, 96)).map_blocks(pid_after_a_while, tmp_path, meta=differing[:0])

@@ -18,6 +18,7 @@ from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel, sample_by_effect
 from hsnoise.statistics.decomposition import Component, mean_of
+from hsnoise.statistics.pixels.probe import PROBE_FRAMES
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.survey import Group, Survey, survey
 from hsnoise.statistics.pixels.taps import levelled
@@ -87,7 +88,7 @@ def _of_the_middle(stack: FrameStack, found: Survey) -> Survey:
         return found
     starts = [(size - drawn) // 4 * 2 for size, drawn in zip(stack.shape, SHAPE, strict=True)]
     rows, columns = ((start, start + drawn) for start, drawn in zip(starts, SHAPE, strict=True))
-    return survey(stack.select(rows=rows, columns=columns))
+    return survey(stack.select(rows=rows, columns=columns, frames=slice(0, PROBE_FRAMES)))
 
 
 def _middle(stack: FrameStack) -> tuple[int, int, int, int] | None:
@@ -152,7 +153,8 @@ def _rows(pairs: list[tuple[Group, Group]], c: int, of: str) -> Iterator[tuple[f
 
 def _typical(group: Group, c: int) -> tuple[float, float]:
     """Temporal variance of the pixels without outliers, DN^2, and its standard error."""
-    mean, error = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), group.n_frames)
+    frames = min(group.n_frames, PROBE_FRAMES)  # with many, pixels that are only brighter would be outliers
+    mean, error = without_outliers(group.pixels(c, "pair_variance_dn2").astype(np.float64), frames)
     return max(mean, 0.0), error  # the noise of row and column offsets has been subtracted
 
 
