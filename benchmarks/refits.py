@@ -16,6 +16,7 @@ import json
 import time
 import zlib
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,6 +26,7 @@ from rich.table import Table
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise._core.conclusion import Light
 
 EFFECTS = {
     "row_noise": fx.RowNoise(1.0),
@@ -44,8 +46,8 @@ EXPOSURE_S, FRAMES, SHAPE = (0.02, 0.05, 0.1, 0.2), 6, (64, 96)
 WITHIN = 1.96
 
 
-def pulls(name: str, number: int, improve_minutes: float | None = None) -> dict[str, float]:
-    """Pull of each number of the refit of capture `number`, or of what `improve` makes of it."""
+def pulls(name: str, number: int, improve_minutes: float | None = None) -> tuple[dict[str, float], str]:
+    """Pull of each number of the refit of capture `number`, or of what `improve` makes of it; and the light of that."""
     camera = hsnoise.cameras.grasshopper3(black_level_dn=64)
     truth = camera.add(OF_THE_LOOP[name])
     key = jax.random.key(zlib.crc32(f"{name} {number}".encode()))
@@ -56,34 +58,43 @@ def pulls(name: str, number: int, improve_minutes: float | None = None) -> dict[
     stack = hsnoise.FrameStack(counts, EXPOSURE_S, black_level=64, white_level=65535, cfa="RGGB", shutter="global")
     if improve_minutes is None:
         fit = hsnoise.fit(stack, model=truth, pixels="alike")
+        light = fit.conclusion.light
     else:
-        fit = hsnoise.improve(stack, max_minutes=improve_minutes, seed=number).fit
-    return {
+        story = hsnoise.improve(stack, max_minutes=improve_minutes, seed=number)
+        fit, light = story.fit, story.conclusion.light
+    found = {
         parameter: (value - truth.table[parameter][0]) / error
         for parameter, (value, error, _) in fit.table.items()
         if parameter in fit.names and parameter in truth.table and parameter not in fit.withheld and np.isfinite(error)
     }
+    return found, str(light)
 
 
-def read(out: Path) -> dict[tuple[str, int], dict[str, float]]:
+Record = dict[str, Any]
+
+
+def read(out: Path) -> dict[tuple[str, int], Record]:
     """Finished captures of the file."""
     lines = map(json.loads, out.read_text().splitlines()) if out.exists() else ()
-    return {(one["effect"], one["number"]): one["pulls"] for one in lines}
+    return {(one["effect"], one["number"]): one for one in lines}
 
 
-def report(found: dict[tuple[str, int], dict[str, float]]) -> Table:
-    """Root mean square and coverage by effect: of the base parameters and of the effect's own."""
-    table = Table("effect", "captures", "base: rms pull", "within 1.96", "own: rms pull", "within 1.96 ")
-    for name in OF_THE_LOOP:
-        some = [one for (effect, _), one in found.items() if effect == name]
-        own = np.array([p for one in some for parameter, p in one.items() if parameter.split(".")[0] == name])
-        base = np.array([p for one in some for parameter, p in one.items() if parameter.split(".")[0] != name])
-        if some:
-            table.add_row(name, f"{len(some)}", *_in_words(base), *_in_words(own))
+def report(found: dict[tuple[str, int], Record]) -> Table:
+    """Root mean square and coverage by effect, of the base parameters and of its own, of results that may be used."""
+    table = Table("effect", "captures", "red", "base: rms pull", "within 1.96", "own: rms pull", "within 1.96 ")
+    for name in (*OF_THE_LOOP, "all"):
+        some = [one for (effect, _), one in found.items() if name in (effect, "all")]
+        used = [(one["effect"], one["pulls"]) for one in some if one["light"] != str(Light.RED)]
+        is_own = [(pull, parameter.split(".")[0] == effect) for effect, of in used for parameter, pull in of.items()]
+        own, base = (np.array([pull for pull, its in is_own if its == wanted]) for wanted in (True, False))
+        if used:
+            table.add_row(name, f"{len(used)}", f"{len(some) - len(used)}", *_in_words(base), *_in_words(own))
     return table
 
 
 def _in_words(values: np.ndarray) -> tuple[str, str]:
+    if not len(values):
+        return "", ""
     return f"{np.sqrt(np.mean(values**2)):.2f}", f"{100 * np.mean(np.abs(values) < WITHIN):.0f} %"
 
 
@@ -104,8 +115,9 @@ def main() -> None:
         for name, number in track([one for one in wanted if one not in found], console=Console(stderr=True)):
             if time.monotonic() > end:
                 break
-            found[name, number] = pulls(name, number, arguments.improve)
-            file.write(json.dumps({"effect": name, "number": number, "pulls": found[name, number]}) + "\n")
+            of, light = pulls(name, number, arguments.improve)
+            found[name, number] = {"effect": name, "number": number, "pulls": of, "light": light}
+            file.write(json.dumps(found[name, number]) + "\n")
             file.flush()
     Console(width=110).print(report(found))
 
