@@ -3,7 +3,7 @@
     python -m benchmarks.scaling                     # writes 1.9 GB to --folder, once; half an hour
     python -m benchmarks.scaling --only fit,budget --largest 100
 
-Each capture lies in a NumPy file that is mapped, of a simulated sensor whose pixels differ; each job is a process of
+On Linux. Each capture lies in a mapped NumPy file, of a simulated sensor whose pixels differ; each job is a process of
 its own. Prints a table and the exponents of growth, and draws the figure of docs/results.md (`--figure`).
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -55,7 +54,13 @@ def measure(job: str, path: Path) -> dict[str, float]:
     run = partial(hsnoise.compare, model) if job == "compare" else getattr(hsnoise, job)
     began = time.monotonic()
     run(stack)
-    return {"s": time.monotonic() - began, "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+    return {"s": time.monotonic() - began, "mib": peak_mib()}
+
+
+def peak_mib() -> float:
+    """Largest resident memory of this process; `ru_maxrss` would begin with that of its parent."""
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
 
 
 def measured(job: str, path: Path) -> dict[str, float]:

@@ -46,6 +46,7 @@ from hsnoise.statistics.structure import OF_FLATS
 
 NEEDED = ("gain", "read_noise")
 MOST_COUNTS = 1 << 26  # of an exposure in memory; of larger ones the first frames
+COURSE = "frame_settling"  # of a run: it is the same in drawn frames
 ROUNDS = 4  # draws that bring the model nearer
 
 
@@ -125,7 +126,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     judging = darks if held_out is None else repeated_darks(held_out)
     judge = Portion.of(judging if flats is None else with_flats(judging, flats))
     with jax.enable_x64(True):
-        models = _Closing.of(darks, seed).with_light(params, stack, flats)
+        models = _Closing.of(darks, params, seed).with_light(params, stack, flats)
     found, comparison = _nearest(models, judge, seed)
     key = key_for(seed, Purpose.SHARES)
     gone = [effect for effect in params if effect.name not in found]
@@ -172,10 +173,16 @@ def _static(named: NoiseModel, frames: FrameStack, key: RandomKey, effects: tupl
     return shares.in_words(shares.static_by_effect(named, longest, key, effects), shares.static_dn2(longest))
 
 
-def _apart(darks: FrameStack) -> tuple[Apart, ...]:
-    return tuple(
-        Apart.of(np.stack(list(darks.frames(i))), float(exposure_s)) for i, exposure_s in enumerate(darks.exposure_s)
-    )
+def _apart(darks: FrameStack, model: NoiseModel) -> tuple[Apart, ...]:
+    """The exposures without the course that the model gives the level of a run, which stays in it."""
+    found = []
+    for i, exposure_s in enumerate(darks.exposure_s):
+        frames = np.stack(list(darks.frames(i)))
+        if COURSE in model:
+            course_e = np.asarray(model[COURSE].course(len(frames)))
+            frames = frames - (float(np.mean(model["gain"].value)) * course_e)[:, None, None]
+        found.append(Apart.of(frames, float(exposure_s)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -187,10 +194,10 @@ class _Closing:
     key: RandomKey
 
     @staticmethod
-    def of(darks: FrameStack, seed: int) -> _Closing:
+    def of(darks: FrameStack, model: NoiseModel, seed: int) -> _Closing:
         key = key_for(seed, Purpose.CLOSE)
         words = np.asarray(jax.random.bits(named_key(key, "maps"), (4,), np.uint32))
-        return _Closing(darks, Sensor(_apart(darks), np.random.default_rng(words), darks.window), key)
+        return _Closing(darks, Sensor(_apart(darks, model), np.random.default_rng(words), darks.window), key)
 
     def closed(self, model: NoiseModel) -> NoiseModel:
         """The model with maps in place of patterns, then brought nearer draw by draw."""
@@ -219,13 +226,13 @@ class _Closing:
 
     def drawn(self, model: NoiseModel, number: int) -> tuple[Apart, ...]:
         """Frames drawn as the measured ones were taken, taken apart."""
-        return _apart(draw_capture(jax.random.fold_in(self.key, number), model, self.darks))
+        return _apart(draw_capture(jax.random.fold_in(self.key, number), model, self.darks), model)
 
     def named_that_hold(self, model: NoiseModel) -> NoiseModel:
         """The model without effects that overshoot in rows, columns or frames: their noise is measured whole."""
         like = capture_like(model, self.darks.shape, float(self.darks.exposure_s.max()))
         axes = ("gain", "row", "column", "frame")
-        feeding = {axis: {one.name for one in model if of_axis(one, axis, like)} for axis in axes}
+        feeding = {axis: {one.name for one in model if of_axis(one, axis, like)} - {COURSE} for axis in axes}
         bare = model
         for name in set().union(*feeding.values()):
             bare = bare.remove(name)

@@ -15,11 +15,13 @@ from hsnoise.effects._parameters import param
 
 
 class FrameSettling(AbstractEffect):
-    """Offset amplitude * exp(-f / frames) in e-, in frame f = 0, 1, ... of each exposure.
+    """Offset amplitude * exp(-f / frames) + slow * exp(-f / slow_frames), e-, in frame f = 0, 1, ... of each exposure.
 
     When a run of frames begins, amplifiers warm up and the black reference finds its level. The course is the same in
     every run, and whatever the exposure: `frame_offset` is new in each frame, and `dark_current_drift` grows with
-    exposure and brings shot noise. A time constant of many frames makes it a straight line.
+    exposure and brings shot noise. A time constant of many frames makes it a straight line. Often one or two frames
+    are far off and the rest creeps, for which there is the second decay. A fit measures both where bias frames, or
+    darks of two exposures, show one course; in a single run, a level that wanders slowly may look the same.
 
     In dark frames: frame means fall (or rise) towards a level, equally in all colours and exposures; the noise of
     pixels stays.
@@ -38,10 +40,16 @@ class FrameSettling(AbstractEffect):
     amplitude: Scalar = param("e-", amplitude=True, doc="offset of the first frame")
     frames: Scalar = param("frame", low=0.1, doc="frames in which it falls by a factor of e")
     after_gain: bool = eqx.field(static=True, default=False)
+    slow: Scalar = param("e-", default=0.0, held=True, doc="the same of a slower decay; simulated fits leave it")
+    slow_frames: Scalar = param("frame", low=0.1, default=100.0, held=True, doc="time constant of that")
+
+    def course(self, frames: int) -> Frames:
+        """Offset of each frame of a run [frame], e-."""
+        frame = jnp.arange(frames, dtype=self.amplitude.dtype)
+        return self.amplitude * jnp.exp(-frame / self.frames) + self.slow * jnp.exp(-frame / self.slow_frames)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        frame = jnp.arange(len(signal), dtype=signal.dtype)[:, None, None]
-        offset = self.amplitude * jnp.exp(-frame / self.frames)
+        offset = self.course(len(signal)).astype(signal.dtype)[:, None, None]
         return signal + capture.offset(offset, self.after_gain)
 
     @classmethod

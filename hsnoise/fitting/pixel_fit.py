@@ -48,6 +48,7 @@ from hsnoise.statistics.pixels.population import Population, Warm, population_of
 from hsnoise.statistics.pixels.read_noise import NoiseSpread, Tail, noise_spread_of, tail_of
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
+from hsnoise.statistics.pixels.settling import Settling
 from hsnoise.statistics.pixels.shading import Shading
 from hsnoise.statistics.pixels.stuck import without_stuck
 from hsnoise.statistics.pixels.survey import Plane, Survey
@@ -128,7 +129,8 @@ class PixelFit:
     taps: blocks of the frame that separate outputs read; None for one output. code_step: of the converter, DN.
     parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
     waves: what crosses the frame obliquely and moves from frame to frame, the strongest first. It is in no read noise.
-    comb: codes of unequal width, if they are. shortest_s: the shortest exposure of repeated darks; 0 without any.
+    comb: codes of unequal width, if they are. settling: the course of the black level over the frames, if it has one.
+    shortest_s: the shortest exposure of repeated darks; 0 without any.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -141,6 +143,7 @@ class PixelFit:
     parity_told: bool
     waves: tuple[Wave, ...]
     comb: Comb | None
+    settling: Settling | None
     shortest_s: float
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -169,7 +172,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb
+    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb, found.settling
     shortest_s = 0.0 if found.shortest is None else found.shortest.exposure_s
     return PixelFit(tuple(channels), flats, *shared, shortest_s, estimate, covariance, bool(known.all()))
 

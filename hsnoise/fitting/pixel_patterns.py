@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.fitting.pixel_lines import Lines, lines_of
-from hsnoise.statistics.decomposition import mean_of
+from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.banding import Banding
+from hsnoise.statistics.pixels.settling import Settling
 from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
@@ -112,6 +113,8 @@ def patterns_of(
         if component in lines and (component in shading or lines[component].far):
             of = lines[component]
             shared = replace(shared, variance_dn2=of.variance_dn2, standard_error_dn2=of.error_dn2)
+        if component == "frame" and (course := found.settling) is not None:
+            shared = _about(course, shared, planes)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
         out[effect] = (
@@ -120,3 +123,14 @@ def patterns_of(
             float(np.hypot(shared.chance_dn2, max(of_mean, scatter.get(component, 0.0)))),
         )
     return out
+
+
+def _about(course: Settling, frame: Component, planes: list[Plane]) -> Component:
+    """The component of frames about the course that they share."""
+    means = np.mean([plane.frame_means_dn for plane in planes], axis=0)
+    of_pixels_dn2 = max(float(means.var(ddof=1)) - frame.variance_dn2, 0.0)  # by which means scatter without offsets
+    scatter = np.sqrt(2 / course.dof)
+    left = course.left_dn2 - of_pixels_dn2
+    return replace(
+        frame, variance_dn2=left, standard_error_dn2=scatter * course.left_dn2, chance_dn2=scatter * of_pixels_dn2
+    )

@@ -24,6 +24,7 @@ from hsnoise.effects import (
     DarkSignalNonuniformity,
     ElectronMultiplication,
     FrameOffset,
+    FrameSettling,
     HotPixels,
     Interference,
     MissingCodes,
@@ -47,7 +48,7 @@ from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
-from hsnoise.fitting.pixel_shared import Shared, of_glow, of_taps, offsets_of, shared_patterns
+from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, offsets_of, shared_patterns
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -73,6 +74,7 @@ OF_PIXELS = (
     Nonlinearity,
     BrighterFatter,
     FrameOffset,
+    FrameSettling,
     RowFixedPattern,
     ColumnFixedPattern,
     RowNoise,
@@ -186,6 +188,7 @@ def _population(
     if (comb := pixel.comb) is not None:
         found["adc_nonuniformity"] = {"sigma": (comb.sigma, comb.error)}
     found |= {} if pixel.taps is None else of_taps(pixel.taps, float(gain.mean()))
+    found |= {} if pixel.settling is None else of_settling(pixel.settling, float(gain.mean()))
     falls, errors = np.array([c.subtracted for c in pixel.channels]).T
     if (falls > SUBTRACTED * errors).all():
         found["black_clamp"] = {"rate": (falls, errors)}
@@ -300,7 +303,11 @@ def _black(pixel: PixelFit, summary: Summary) -> tuple[np.ndarray, np.ndarray]:
     """Black level [channel] and its error: as given, or the level without signal."""
     if summary.black_level_dn is not None:
         return np.asarray(summary.black_level_dn, float), np.zeros(len(pixel.channels))
-    return np.array([c.black_dn[0] for c in pixel.channels]), np.array([c.black_dn[1] for c in pixel.channels])
+    level, error = np.array([c.black_dn for c in pixel.channels]).T
+    if pixel.settling is not None:  # to which it settles
+        offset, of_offset = pixel.settling.mean_dn(min(summary.n_frames))
+        return level - offset, np.hypot(error, of_offset)
+    return level, error
 
 
 def _rows(pixel: PixelFit) -> tuple[np.ndarray, np.ndarray]:
@@ -337,6 +344,8 @@ def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[
     """What an effect has besides numbers."""
     if name in shared:
         return {"after_gain": shared[name].after_gain}
+    if name == "frame_settling":
+        return {"after_gain": len(pixel.channels) > 1}  # alike in DN in all colours
     if name == "black_shading" and (drift := _shading(pixel)) is not None:
         return {"axis": drift[0], "start": drift[1].start, "above": drift[1].above}
     if name == "periodic_banding" and (wave := pixel.channels[0].banding) is not None:

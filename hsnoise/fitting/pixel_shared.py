@@ -10,6 +10,7 @@ import numpy as np
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.statistics.pixels.glow import Glow
+from hsnoise.statistics.pixels.settling import Settling
 from hsnoise.statistics.pixels.taps import GAINS_APART, LEAST, Taps
 
 PATTERN_THERE, LEAST_PATTERN = 6.0, 1e-4  # chance deviations, share of the temporal variance
@@ -83,6 +84,14 @@ def of_taps(taps: Taps, gain: float) -> dict[str, dict[str, tuple[float, float]]
     if taps.gains_differ:
         found["tap_gains"] = {"spread": (spread, float(np.hypot(spread / few, error)))}
     return found
+
+
+def of_settling(course: Settling, gain: float) -> dict[str, dict[str, tuple[float, float]]]:
+    """The course of the black level in electrons; time constants are held."""
+    fields = {"amplitude": course.offset_dn, "slow": course.slow_dn}
+    found = {name: (value / gain, error / gain) for name, (value, error) in fields.items() if value}
+    frames = {"frames": course.frames} | ({"slow_frames": course.slow_frames} if "slow" in found else {})
+    return {"frame_settling": found | {name: (value, np.inf) for name, value in frames.items()}}
 
 
 def of_glow(channels: Sequence[Glowing], gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:

@@ -20,6 +20,7 @@ from hsnoise.statistics.pixels.look import Look, OddLines
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
+from hsnoise.statistics.pixels.settling import Settling, settling_of
 from hsnoise.statistics.pixels.waves import Spectrum, Wave, spectrum_of, waves_of
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -178,6 +179,13 @@ class Survey:
     def comb(self) -> Comb | None:
         """The pattern of the widths of codes, if all exposures share one."""
         return comb_of([group.codes for group in self.groups if group.codes is not None])
+
+    @cached_property
+    def settling(self) -> Settling | None:
+        """The course of the black level over the frames, if all repeated darks have the same."""
+        groups = self.repeated_darks
+        runs = [np.mean([plane.frame_means_dn for plane in group.planes], axis=0) for group in groups]
+        return settling_of(runs, is_bias=all(group.exposure_s == 0 for group in groups))
 
     @property
     def has_exposures(self) -> bool:
