@@ -85,9 +85,11 @@ def figure(found: dict[tuple[str, str], tuple[list[float], list[dict[str, float]
         column = 0 if axis == "Mpixel" else 1
         for row, name in enumerate(("s", "mib")):
             axes[row, column].loglog(sizes, [value[name] for value in values], "o-", label=job)
+            axes[row, column].set_yscale("log" if name == "s" else "linear")
         axes[1, column].set_xlabel("pixels of 32 frames / Mpixel" if column == 0 else "frames of 240 x 320")
     for ax in axes[1]:
         ax.axhline(1024, color="0.5", ls=":")
+        ax.set_ylim(0, 1200)
     axes[0, 0].set_ylabel("time / s")
     axes[1, 0].set_ylabel("peak memory / MiB")
     axes[0, 0].legend()

@@ -238,6 +238,7 @@ def _group(
     seen = stack.fold_frames(i, look.start, look.add, look.merge, tick)
     assert seen.odd is not None  # FrameStack has no empty groups
     kept, pixels = np.stack(seen.kept), n * np.bincount(tile.ravel()) * seen.sums[0].pixel.size
+    seen.kept.clear()  # it is there twice
     half = int(np.searchsorted(rows[::step], stack.shape[0] / 2)) if looks_for_row_groups else None
     planes = tuple(
         _plane(seen.sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
