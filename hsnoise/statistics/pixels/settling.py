@@ -39,10 +39,14 @@ class Settling(NamedTuple):
     dof: int
 
     def mean_dn(self, frames: int) -> tuple[float, float]:
-        """Mean offset of the first frames of a run, and its error, DN."""
-        fast, slow = (float(np.exp(-np.arange(frames) / tau).mean()) for tau in (self.frames, self.slow_frames))
-        (a, of_a), (b, of_b) = self.offset_dn, self.slow_dn
-        return a * fast + b * slow, float(np.hypot(of_a * fast, of_b * slow))
+        """Mean offset of the first frames of a run, and its error, DN.
+
+        What has not settled by the last frame counts as an error: how it goes on is not measured.
+        """
+        size, errors = np.array([self.offset_dn, self.slow_dn]).T
+        decays = np.exp(-np.arange(frames) / np.array([[self.frames], [self.slow_frames]]))
+        mean = decays.mean(1)
+        return float(size @ mean), float(np.linalg.norm([*(errors * mean), size @ decays[:, -1]]))
 
 
 def settling_of(means_dn: Sequence[np.ndarray], is_bias: bool) -> Settling | None:
