@@ -166,7 +166,7 @@ def _looked_at(stack: FrameStack, i: int, look: Callable[[np.ndarray], Any]) -> 
             return str(error)
 
     if is_dask(stack.counts[i]):
-        with suppress(ValueError, OSError):  # those of which frame, is found frame by frame
+        with suppress(ValueError, OSError):  # which frame it was, the loop below tells
             yield from list(stack.map_frames(i, look))
             return
     with ThreadPoolExecutor(READERS) as pool:
