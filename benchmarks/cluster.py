@@ -21,6 +21,7 @@ import numpy as np
 from rich.console import Console
 
 import hsnoise
+from benchmarks.hidden_effect import shape as shape_of
 from hsnoise._core.sheet import Sheet
 
 EXPOSURE_S = (0.02, 0.1, 0.5, 2.0)
@@ -83,11 +84,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", default="1,2", help="processes, by turns (default 1,2)")
     parser.add_argument("--frames", type=int, default=64, help="of each of the four exposures (default 64)")
-    parser.add_argument("--shape", default="160x240", help="rows x columns")
+    parser.add_argument("--shape", type=shape_of, default="160x240", help="rows x columns")
     parser.add_argument("--read-ms", type=float, default=100, help="that a frame takes to be read, beside its making")
     parser.add_argument("--only", default=",".join(JOBS), help=f"of {', '.join(JOBS)}")
     arguments = parser.parse_args()
-    rows, columns = (int(n) for n in arguments.shape.split("x"))
     from distributed import Client, LocalCluster
 
     sheet = Sheet("Frames read on a cluster", ("job", "workers", "time / s", "read once, twice, more", "mean"))
@@ -99,7 +99,7 @@ def main() -> None:
             LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
             Client(cluster),
         ):
-            counts = frames_of(arguments.frames, (rows, columns), arguments.read_ms / 1e3, Path(folder))
+            counts = frames_of(arguments.frames, arguments.shape, arguments.read_ms / 1e3, Path(folder))
             if model is None and "compare" in jobs:  # and all is compiled and imported
                 model = hsnoise.fit(counts, exposure_s=EXPOSURE_S, **CAPTURE).params
             for name in jobs:

@@ -1,10 +1,10 @@
 """The story of each real sensor: its budget, what the textbook model believes, what was added, what is only measured.
 
     python -m benchmarks.sensors --out build/sensors            # all captures of shared/data, half an hour
-    python -m benchmarks.sensors --only ST-8 KAF --out docs/figures
+    python -m benchmarks.sensors --only ST-8 KAF
 
-Writes NAME.md, the numbers of docs/sensors.md, and NAME.png: a dark frame and one drawn from the model, both
-with the same grey scale, and their means of rows and columns.
+Writes NAME.md, the numbers of docs/sensors.md, NAME.json, the model, and sensor_NAME.png: a dark frame and one drawn
+from the model, both with the same grey scale, the means of all, and their means of rows and columns.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def told(name: str, stack: hsnoise.FrameStack, out: Path) -> tuple[str, ...]:
     began = time.monotonic()
     fit = hsnoise.fit(stack)
     found = hsnoise.compare(fit, stack)
-    plain = hsnoise.compare(textbook(stack), stack)
+    usual = textbook(stack)
+    plain = hsnoise.compare(usual, stack)
     closed = closed_model(fit, stack)
     seconds = time.monotonic() - began
     lines = [
@@ -76,7 +77,7 @@ def told(name: str, stack: hsnoise.FrameStack, out: Path) -> tuple[str, ...]:
         "",
         *budget_of(stack),
         "",
-        *believed(textbook(stack), fit, plain),
+        *believed(usual, fit, plain),
         "",
         *table_of(fit),
         "",
@@ -84,7 +85,7 @@ def told(name: str, stack: hsnoise.FrameStack, out: Path) -> tuple[str, ...]:
     ]
     (out / f"{name}.md").write_text("\n".join(lines) + "\n")
     fit.params.save(out / f"{name}.json")
-    draw(fit.params, stack).savefig(out / f"{name.lower()}.png", dpi=100)
+    draw(fit.params, stack).savefig(out / f"sensor_{name.lower().replace('-', '')}.png", dpi=100)
     errors = (f"{one:.3g}" for one in (plain.error, found.error, closed.comparison.error))
     return (name, *errors, found.worst_group, f"{seconds:.0f} s")
 
@@ -141,7 +142,7 @@ def shares_of(closed: ClosedModel) -> Iterable[str]:
 def draw(model: hsnoise.NoiseModel, stack: hsnoise.FrameStack) -> Figure:
     """A frame of the longest repeated darks and a drawn one, the means of all, and their means of rows and columns."""
     darks = Portion.of(stack).darks.frames
-    e = max(_repeated(darks), key=lambda i: darks.exposure_s[i])
+    e = max(darks.repeated_darks, key=lambda i: darks.exposure_s[i])
     counts = [np.stack(list(of.frames(e))).astype(float) for of in (darks, draw_capture(1, model, darks))]
     part = tuple(
         slice(max(size - most, 0) // 2, max(size - most, 0) // 2 + most)
@@ -169,11 +170,6 @@ def draw(model: hsnoise.NoiseModel, stack: hsnoise.FrameStack) -> Figure:
     figure.legend(*axes[2, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     figure.suptitle(f"Darks of {darks.exposure_s[e]:g} s", fontsize=12)
     return figure
-
-
-def _repeated(darks: hsnoise.FrameStack) -> list[int]:
-    """Exposures of two frames or more, else all."""
-    return darks.repeated_darks or list(range(darks.n_exposures))
 
 
 def main() -> None:
