@@ -10,7 +10,8 @@ tested. Each has the loss of its paper (the ST-LSTM's without the perceptual ter
 on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
 a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained` adds methods that
 need no training, tuned on the first validation clip. Outputs are scored as they are, and scaled in brightness to the
-truth. Finished trainings and scores are kept in `--out`; the same command resumes.
+truth. Finished trainings and scores are kept in `--out`; the same command resumes. `--noise gaussian` trains with
+simpler noise of the same strength; tests have the camera's.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import numpy as np
 import optax
 from rich.console import Console
 
+from benchmarks._network_scores import csv_of, picture_name, scores_of, tables, write_picture
 from benchmarks.rivals.fastdvdnet import FastDVDnet
 from benchmarks.rivals.ffdnet import FFDNet
 from benchmarks.rivals.kpn import KPN
@@ -39,16 +41,14 @@ from benchmarks.rivals.layers import Noise, Rival, noise_map_of
 from benchmarks.rivals.toflow import TOFlow
 from hsnoise._core.keys import named_key
 from hsnoise._core.output import write_atomically
-from hsnoise._core.sheet import Sheet
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
-from hsnoise.enhance.training.evaluate import Method, prepared, scores
-from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of
+from hsnoise.enhance.training.evaluate import Method, prepared
+from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of, noise_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
 from hsnoise.enhance.training.rivals import Denoiser, rivals
 from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
-from hsnoise.enhance.training.tables import standard_error
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import read_arrays, write_arrays
 from hsnoise.model import NoiseModel
@@ -56,32 +56,33 @@ from hsnoise.stlstm import STLSTM, loss
 
 OURS = "ST-LSTM"
 RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
+MINUTES = 10.0  # of a training
 RATES = (3e-4, 1e-3, 3e-3)
 TRIAL = 1 / 6  # of the budget, for each rate
 FRAMES, SIDE = 8, 64
 MAPS, STRIDE = 64, 4  # of the ST-LSTM
-LEVELS, TESTED_FRAMES = 3, 10  # 10: all clips have as many, so that networks are compiled once
+LEVELS, TESTED_FRAMES = 5, 10  # 10: all clips have as many, so that networks are compiled once
 SEED = 0
 SPLIT = Path(__file__).parent / "split.toml"
 OPTIMISER = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0))  # as `hsnoise train`; rates are arguments
-SCORES = ("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled")
 
 
 class Ours(eqx.Module):
-    """The ST-LSTM as the rivals are used."""
+    """The ST-LSTM as the rivals are used. unroll: frames that are compiled into one piece."""
 
     net: STLSTM
+    unroll: int = eqx.field(static=True, default=1)
 
     def whole_video(self, frames: jax.Array) -> jax.Array:
         return self.net.video(frames)
 
     def loss(self, frames: jax.Array, clean: jax.Array, done: jax.Array) -> jax.Array:
-        return loss(self.net.video(frames), clean)
+        return loss(self.net.video(frames, unroll=self.unroll), clean)
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a training may use: minutes, or a number of steps."""
+    """What a training may use: minutes, a number of steps, or whichever ends first."""
 
     minutes: float | None
     steps: int | None
@@ -92,17 +93,26 @@ class Budget:
             None if self.steps is None else max(1, round(share * self.steps)),
         )
 
+    def used(self, steps: int, minutes: float) -> float:
+        """The share that is used up after so many steps and minutes."""
+        return max(0.0 if most is None else of / most for of, most in ((steps, self.steps), (minutes, self.minutes)))
+
+    def __str__(self) -> str:
+        parts = "" if self.steps is None else f"{self.steps}", "" if self.minutes is None else f"{self.minutes:g}min"
+        return "-".join(filter(None, parts))
+
 
 @dataclass(frozen=True, eq=False)
 class Setting:
     """What all trainings share.
 
-    model: the camera's, in single precision; noise: for noise maps; pieces: of clips in a step; digest: of the camera,
-    its light and all clips.
+    model: the camera's, trained_on: that of the noise in training, both in single precision; noise: for noise maps;
+    pieces: of clips in a step; digest: of the camera, its light and all clips.
     """
 
     camera: Camera
     model: NoiseModel
+    trained_on: NoiseModel
     noise: Noise
     train: Sequence[Clip]
     validation: Sequence[Clip]
@@ -116,7 +126,8 @@ class Setting:
         if name in RIVALS:
             return partial(RIVALS[name], noise=self.noise, width=self.width)
         maps = max(1, round(MAPS * self.width))
-        return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels))
+        unroll = 1 if jax.default_backend() == "cpu" else FRAMES
+        return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels), unroll)
 
     def batch(self, step: int) -> Batch:
         return crops(self.train, batch_rng(SEED, step), self.pieces, FRAMES, SIDE)
@@ -131,28 +142,18 @@ class Setting:
         key = jax.random.fold_in(named_key(jax.random.key(SEED), "noise"), number)
         light = jnp.asarray(self.camera.mean_e, jnp.float32)
         rates = jnp.asarray([rate * (1 + math.cos(math.pi * done)) / 2, done], jnp.float32)
-        return _step(state, self.batch(number), key, self.model, light, self.camera.sensor, *rates)
+        models = self.model, self.trained_on
+        return _step(state, self.batch(number), key, *models, light, self.camera.sensor, *rates)
 
 
 @eqx.filter_jit
-def _step(state, batch: Batch, key, model: NoiseModel, light, sensor: Shape | None, rate, done):
+def _step(state, batch: Batch, key, camera: NoiseModel, noise: NoiseModel, light, sensor: Shape | None, rate, done):
     net, memory = state
-    pair = examples(batch, key, model, model, light, JITTER, sensor)
+    pair = examples(batch, key, camera, noise, light, JITTER, sensor)
     clean, noisy = (frames.swapaxes(0, 1) for frames in pair)
     value, slope = eqx.filter_value_and_grad(lambda net: net.loss(noisy, clean, done))(net)
     change, memory = OPTIMISER.update(slope, memory)
     return (eqx.apply_updates(net, jax.tree.map(lambda of: rate * of, change)), memory), value
-
-
-def scores_of(found: np.ndarray, scene: Scene) -> dict[str, float]:
-    """PSNR and SSIM as it is and scaled in brightness to the truth, means over frames."""
-
-    def measured(frames: np.ndarray) -> tuple[float, ...]:
-        of_frames = scores("", scene, frames)
-        return tuple(float(np.mean([one[what] for one in of_frames])) for what in ("psnr_db", "ssim"))
-
-    as_is, scaled = measured(np.clip(found, 0, 1)), measured(scaled_to(found, scene.clean))
-    return dict(zip(SCORES, (*as_is, *scaled), strict=True))
 
 
 @eqx.filter_jit
@@ -161,8 +162,7 @@ def _enhanced(net, noisy: jax.Array) -> jax.Array:
 
 
 def named(setting: Setting, name: str, budget: Budget) -> str:
-    length = f"{budget.minutes:g}min" if budget.steps is None else f"{budget.steps}"
-    return f"{name}-{setting.width:g}-{setting.pieces}-{length}-{setting.digest}"
+    return f"{name}-{setting.width:g}-{setting.pieces}-{budget}-{setting.digest}"
 
 
 def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[Any, dict]:
@@ -176,7 +176,7 @@ def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[A
         state, value = setting.step(state, number, done, rate)
         value.block_until_ready()
         number += 1
-        done = number / budget.steps if budget.steps else (time.monotonic() - begun) / (60 * budget.minutes)
+        done = budget.used(number, (time.monotonic() - begun) / 60)
     about = {"network": name, "rate": rate, "steps": number, "loss": float(value)}
     about |= {"minutes": (time.monotonic() - begun) / 60, "parameters": parameters_of(state[0])}
     write_arrays(path, state[0], about)
@@ -189,7 +189,9 @@ def parameters_of(net: Any) -> int:
 
 
 def best_rate(setting: Setting, name: str, budget: Budget, rates: Sequence[float], crop: int) -> float:
-    """The rate with the highest PSNR on the validation clips after a short training."""
+    """The rate with the highest PSNR on the validation clips after a short training; a single one is not tried."""
+    if len(rates) == 1:
+        return rates[0]
     mean_e = middle_of(setting.camera.mean_e)
     clips = enumerate(setting.validation)
     scenes = [scene_of(clip, setting.camera, mean_e, crop, seed, TESTED_FRAMES) for seed, clip in clips]
@@ -208,40 +210,15 @@ def _of_scene(net: Any, scene: Scene) -> np.ndarray:
     return np.asarray(_enhanced(net, scene.noisy))
 
 
-def tested(method: Method, scenes: Sequence[Scene]) -> dict[str, dict[str, float]]:
-    """Scores of each video, means over levels of light. method: display values of a scene."""
-    found: dict[str, list[dict[str, float]]] = {}
+def tested(method: Method, scenes: Sequence[Scene], shown: Path) -> list[dict[str, Any]]:
+    """Scores of each frame of all scenes. method: display values of a scene; shown: folder for their last frames."""
+    shown.mkdir(parents=True, exist_ok=True)
+    records = []
     for scene in scenes:
-        found.setdefault(scene.clip, []).append(scores_of(method(scene), scene))
-    return {
-        clip: {what: float(np.mean([of[what] for of in all_of])) for what in SCORES} for clip, all_of in found.items()
-    }
-
-
-def with_error(values: Sequence[float], digits: int, sign: str = "") -> str:
-    return f"{np.mean(values):{sign}.{digits}f} +- {standard_error(values):.{digits}f}"
-
-
-def tables(results: dict[str, dict]) -> list[Sheet]:
-    """Scores of each network, and those of the ST-LSTM less each rival's; standard errors over videos."""
-    digits = dict(zip(SCORES, (2, 3, 2, 3), strict=True))
-    heads = ("PSNR / dB", "SSIM", "PSNR scaled / dB", "SSIM scaled")
-
-    def row(name: str, less: str | None = None) -> tuple[str, ...]:
-        of = results[name]["clips"]
-        apart = {w: [of[c][w] - (results[less]["clips"][c][w] if less else 0.0) for c in of] for w in SCORES}
-        return tuple(with_error(values, digits[what], "+" if less else "") for what, values in apart.items())
-
-    def about(of: dict) -> tuple[str, ...]:
-        if "parameters" not in of:  # of a method that is not trained
-            return "", "", "", ""
-        return f"{of['parameters']:,}", f"{of['steps']:,}", f"{of['minutes']:.1f}", f"{of['rate']:g}"
-
-    own = [(name, *about(of), *row(name)) for name, of in results.items()]
-    less = [(f"{OURS} - {name}", *row(OURS, name)) for name in results if name != OURS and OURS in results]
-    first = ("network", "parameters", "steps", "minutes", "rate", *heads)
-    sheets = Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *heads), less)
-    return [sheet for sheet in sheets if sheet.rows]
+        found = method(scene)
+        records += scores_of(found, scene)
+        write_picture(shown / picture_name(scene), scaled_to(found, scene.clean)[-1])
+    return records
 
 
 def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
@@ -252,31 +229,33 @@ def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     validation, test = ([clip for clip in clips if not clip.is_long] for clips in others)
     check_sizes([*training, *validation, *test], FRAMES, SIDE)
     options.out.mkdir(parents=True, exist_ok=True)
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), camera.model)
-    digest = digest_of(camera.model, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
-    noise = noise_map_of(camera)
-    return Setting(camera, model, noise, training, validation, options.width, options.batch, options.out, digest), test
+    models = camera.model, noise_of(options.noise, camera)
+    digest = digest_of(models, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
+    models = (jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model) for model in models)
+    sizes = options.width, options.batch, options.out, digest
+    return Setting(camera, *models, noise_map_of(camera), training, validation, *sizes), test
 
 
 def measures(
     setting: Setting, scenes: Sequence[Scene], options: argparse.Namespace
 ) -> dict[str, Callable[[], dict[str, Any]]]:
     """By name of a method, what trains or tunes it if need be and gives its scores; those in `--out` are read."""
-    budget = Budget(None if options.steps else options.minutes, options.steps)
+    budget = Budget(options.minutes if options.minutes or options.steps else MINUTES, options.steps)
+    noise = "" if options.noise == "hsnoise" else f", {options.noise} noise"
 
     def of_network(name: str) -> dict[str, Any]:
         rate = best_rate(setting, name, budget, options.rates, options.crop)
         net, about = trained(setting, name, rate, budget)
-        return about | {"clips": tested(partial(_of_scene, net), scenes)}
+        return about | {"frames": tested(partial(_of_scene, net), scenes, options.out / f"{name}{noise}")}
 
     def of_untrained(name: str, denoise: Denoiser) -> dict[str, Any]:
         mean_e = middle_of(setting.camera.mean_e)
         tuning = scene_of(setting.validation[0], setting.camera, mean_e, options.crop, 99, TESTED_FRAMES)
-        return {"clips": tested(prepared(name, denoise, tuning), scenes)}
+        return {"frames": tested(prepared(name, denoise, tuning), scenes, options.out / name)}
 
     rates = "-".join(f"{rate:g}" for rate in options.rates)
     found = {
-        name: partial(
+        name + noise: partial(
             kept, setting.out / f"{named(setting, name, budget)}-{rates}-{options.crop}.json", of_network, name
         )
         for name in options.networks
@@ -305,8 +284,9 @@ def run(options: argparse.Namespace) -> None:
     results: dict[str, dict] = {}
     for name, measure in measures(setting, scenes, options).items():
         results[name] = measure()
-        sheets = tables(results)
+        sheets = tables(results, OURS)
         write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
+        write_atomically(options.out / "networks.csv", csv_of(results).encode())
     for sheet in sheets:
         Console(width=150).print(sheet.rich())
 
@@ -322,8 +302,9 @@ def main(argv: list[str] | None = None) -> None:
         default=SPLIT,
         help="which clips train, validate and test (default: benchmarks/split.toml)",
     )
-    add("--minutes", type=float, default=10.0, help="of training, for each network (default: 10)")
-    add("--steps", type=int, help="steps of training for each network, instead of minutes")
+    add("--minutes", type=float, help=f"of training, for each network (default: {MINUTES:g}, without --steps)")
+    add("--steps", type=int, help="of training, for each network; with --minutes whichever ends first")
+    add("--noise", default="hsnoise", help="in training: hsnoise, gaussian, poisson-gaussian or a model.json")
     add("--rates", type=float, nargs="+", default=RATES, help="learning rates that are tried (default: 3e-4 1e-3 3e-3)")
     add("--camera", default="canon_5d3", help="canon_5d3, grasshopper3 or a model.json (default: canon_5d3)")
     add("--lux", type=float, nargs=2, help="dim and bright light of the scenes (default: the paper's)")
@@ -331,12 +312,13 @@ def main(argv: list[str] | None = None) -> None:
     add("--width", type=float, default=0.25, help="numbers of feature maps over the published ones (default: 0.25)")
     add("--batch", type=int, default=4, help="pieces of clips in a step of training (default: 4)")
     add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
-    add("--networks", nargs="+", default=names, choices=names, help="default: all")
+    add("--networks", nargs="*", default=names, choices=names, help="default: all")
     add("--untrained", action="store_true", help="non-local means, total variation, and BM3D, BM4D if installed, too")
     add("--out", type=Path, default=Path("build/networks"), help="default: build/networks")
     options = parser.parse_args(argv)
-    if options.minutes <= 0 or (options.steps is not None and options.steps < 1):
-        parser.error(f"--minutes, --steps: expected more than 0, got {options.minutes}, {options.steps}")
+    for option in ("minutes", "steps"):
+        if (value := getattr(options, option)) is not None and not 0 < value < math.inf:
+            parser.error(f"--{option}: expected more than 0, got {value:g}")
     if min(options.rates) <= 0:
         parser.error(f"--rates: expected above 0, got {options.rates}")
     if options.width <= 0 or options.crop < SIDE or options.batch < 1:

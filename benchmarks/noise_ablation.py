@@ -7,8 +7,10 @@ and read noise on the sensor's line of variance against mean, (c) the paper's mo
 after `hsnoise.improve`. Two limits: (e) light and its shot noise on the real dark frames that were fitted, which is the
 most that a noise model can give, and (f) the same with their pixels shuffled, all frames alike: real distributions
 without structure. The networks are tested on held-out clips whose light, with shot noise, is added to dark frames of
-the sensor that no fit has seen. Real and drawn frames both have the level of their darks subtracted. Finished parts are
-kept in `--out`; the same command resumes. The settings of the runs in docs/results.md are those of ablation.toml.
+the sensor that no fit has seen. Real and drawn frames both have the level of their darks subtracted. Outputs are scored
+as they are, and scaled in brightness to the truth. `--networks st-lstm,toflow` does it with both networks. Finished
+parts are kept in `--out`; the same command resumes. The settings of the runs in docs/results.md are those of
+ablation.toml.
 
 The sensors' data are in a folder outside the project (HSNOISE_SHARED, or ../shared).
 """
@@ -23,39 +25,35 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import track
+from skimage.metrics import structural_similarity
 
 import hsnoise
+from benchmarks._ablation_networks import NETWORKS, Kind, Video
 from benchmarks._ablation_sensors import Sensor, sensors
+from benchmarks._ablation_tables import NOISES, REAL, SCORES, SHUFFLED, picked, table_of
 from hsnoise import NoiseModel
 from hsnoise._core.output import write_atomically
-from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.criticism.improve import improved
 from hsnoise.enhance.mosaic import electrons_of
-from hsnoise.enhance.training import tables
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
-from hsnoise.enhance.training.presets import Recipe
-from hsnoise.enhance.training.protocol import PROTOCOL, middle_of
-from hsnoise.enhance.training.steps import Trainer, batch_rng, digest_of
+from hsnoise.enhance.training.protocol import PROTOCOL, middle_of, scaled_to
+from hsnoise.enhance.training.steps import batch_rng, digest_of
 from hsnoise.enhance.training.validation import psnr_db
-from hsnoise.enhance.weights import load_network, save_network
 
-NOISES = ("gaussian", "poisson-gaussian", "paper", "improved")
-REAL, SHUFFLED = "real darks", "shuffled darks"
-LIMITS = (REAL, SHUFFLED)
 SETTINGS = Path(__file__).parent / "ablation.toml"
 DIM, BRIGHT = 0.4, 1.6  # photoelectrons of the average, in standard deviations of a dark frame
 BATCH, FRAMES, CROP = 4, 8, 128
 NEAR = 3.0  # standard deviations
 MATCH_SIDE = 256
+Scored = dict[str, dict[str, float]]  # {clip: {score: value}}
 
 
 def models_of(sensor: Sensor, out: Path, minutes: float) -> dict[str, NoiseModel]:
@@ -102,7 +100,7 @@ def drawn_darks(noise: NoiseModel) -> np.ndarray:
 
 
 def trained(
-    camera: Camera, name: str, noise: NoiseModel | np.ndarray, clips: Sequence[Clip], seed: int, options
+    kind: Kind, camera: Camera, name: str, noise: NoiseModel | np.ndarray, clips: Sequence[Clip], seed: int, options
 ) -> Path:
     """Path of the weights of a network trained with the noise called `name`: a model's, or that of dark frames."""
     darks = noise if isinstance(noise, np.ndarray) else None
@@ -111,14 +109,12 @@ def trained(
         camera = levelled(camera, level_of(drawn_darks(model)))
     sizes = (options.stride, options.side, options.jitter, camera.sensor, camera.mean_e, PROTOCOL)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
-    path = options.out / f"{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
+    path = options.out / f"{kind.prefix}{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
         return path
-    trainer = Trainer(
-        Recipe(maps=options.maps, stride=options.stride), options.steps, camera, model, jitter=options.jitter
-    )
+    trainer = kind.trainer(camera, model, options)
     state = trainer.start(seed)
-    text = f"{camera.name}, {name}, seed {seed}"
+    text = f"{kind.prefix}{camera.name}, {name}, seed {seed}"
     for step in track(range(options.steps), text, console=Console(stderr=True), transient=True):
         rng = batch_rng(seed, step)
         batch = crops(clips, rng, BATCH, FRAMES, options.side)
@@ -127,7 +123,7 @@ def trained(
         else:
             state, value = trainer.learn(state, *real_examples(batch, darks, camera, rng))
     about = {"camera": camera.name, "noise": name, "steps": options.steps, "clips": [clip.name for clip in clips]}
-    save_network(path, trainer.network(state), about)
+    kind.save(path, trainer.network(state), about)
     print(f"{text}: loss {float(value):.4f}", flush=True)
     return path
 
@@ -188,86 +184,37 @@ def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[n
     return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
 
 
-def measured(sensor: Sensor, path: Path, camera: Camera, clips: Sequence[Clip], places: int) -> dict[str, float]:
-    """PSNR of each clip, dB, mean over several places on the sensor, which share the difficulty of a clip."""
-    net, _ = load_network(path)
-    video = eqx.filter_jit(lambda noisy: net.video(noisy[:, None])[:, 0])
+def measured(sensor: Sensor, video: Video, camera: Camera, clips: Sequence[Clip], places: int) -> Scored:
+    """Scores of each clip, means over several places on the sensor, which share the difficulty of a clip."""
 
-    def psnr(clip: Clip, seed: int) -> float:
+    def scored(clip: Clip, seed: int) -> tuple[float, ...]:
         clean, noisy = real_scene(sensor, clip, camera, seed)
-        return psnr_db(np.asarray(video(jnp.asarray(noisy))), clean)
+        found = video(jnp.asarray(noisy))
+        scaled = scaled_to(found, clean)
+        pairs = zip(scaled, clean, strict=True)
+        ssim = [structural_similarity(one, truth, channel_axis=-1, data_range=1.0) for one, truth in pairs]
+        return psnr_db(found, clean), psnr_db(scaled, clean), float(np.mean(ssim))
 
-    return {
-        clip.name: float(np.mean([psnr(clip, 1000 * i + place) for place in range(places)]))
+    means = {
+        clip.name: np.mean([scored(clip, 1000 * i + place) for place in range(places)], 0)
         for i, clip in enumerate(clips)
     }
-
-
-def table_of(results: dict[str, dict[str, list[dict[str, float]]]]) -> Sheet:
-    """Mean PSNR of each sensor and noise over seeds and clips, and gains over (b) with their standard errors.
-
-    Last the share of what training on real darks gains that the improved model gains, too.
-    """
-    over = ("paper", "improved", REAL)
-    head = ("sensor", *NOISES, *LIMITS, *(f"{name} - poisson-gaussian" for name in over), "share of the gap closed")
-    rows = []
-    for sensor, of in results.items():
-        means = [np.mean([v for clips in of[name] for v in clips.values()]) for name in (*NOISES, *LIMITS)]
-        gains = {name: gain_of(apart(of[name], of["poisson-gaussian"])) for name in over}
-        told = [f"{mean:+.2f} +- {error:.2f} dB" for mean, error in gains.values()]
-        rows.append((sensor, *(f"{mean:.2f}" for mean in means), *told, _share(of, gains)))
-    return Sheet("PSNR on real dark frames, dB", head, rows)
-
-
-def apart(one: list[dict[str, float]], other: list[dict[str, float]], share: float = 1.0) -> list[dict[str, float]]:
-    """Differences {clip: dB} of two noises, seed by seed: the first less this share of the other."""
-    return [{clip: of[clip] - share * less[clip] for clip in of} for of, less in zip(one, other, strict=True)]
-
-
-def _share(of: dict[str, list[dict[str, float]]], gains: dict[str, tuple[float, float]]) -> str:
-    """Gain of the improved model over that of real darks, its error from clips; none if real darks gain nothing."""
-    (ours, _), (most, error) = gains["improved"], gains[REAL]
-    if most < 2 * error or most <= 0:
-        return "no gap beyond chance"
-    share, base = ours / most, of["poisson-gaussian"]
-    _, error = gain_of(apart(apart(of["improved"], base), apart(of[REAL], base), share))
-    return f"{100 * share:.0f} +- {100 * error / most:.0f} %"
-
-
-def gain_of(differences: list[dict[str, float]]) -> tuple[float, float]:
-    """Mean of differences {clip: dB} of several seeds, and its standard error: over clips or seeds, if larger.
-
-    Seeds hold out different clips, so both contain the scatter between clips, and the second that between trainings.
-    If more seeds repeat the clips, only the first contains the scatter between clips, and both are added.
-    """
-    clips = sorted({clip for of in differences for clip in of})
-    of_clips = [[of[clip] for of in differences if clip in of] for clip in clips]
-    of_seeds = [list(of.values()) for of in differences]
-    errors = [standard_error([float(np.mean(values)) for values in groups]) for groups in (of_clips, of_seeds)]
-    repeated = any(len(values) > 1 for values in of_clips)
-    return float(np.mean([value for of in of_seeds for value in of])), float(np.hypot(*errors)) if repeated else max(
-        errors
-    )
-
-
-def standard_error(means: Sequence[float]) -> float:
-    """Standard error of the mean of these means; 0 for a single one, which cannot show it."""
-    return tables.standard_error(means) if len(means) > 1 else 0.0
+    return {clip: dict(zip(SCORES, map(float, of), strict=True)) for clip, of in means.items()}
 
 
 def judged(
-    sensor: Sensor, folds: Sequence[tuple[list[Clip], list[Clip]]], options
-) -> dict[str, list[dict[str, float]]]:
-    """PSNR of each clip, dB, in each fold, by the noise that the network was trained with."""
+    kind: Kind, sensor: Sensor, folds: Sequence[tuple[list[Clip], list[Clip]]], options
+) -> dict[str, list[Scored]]:
+    """Scores of each clip in each fold, by the noise that networks of this kind were trained with."""
     models = models_of(sensor, options.out, options.minutes)
     camera = camera_of(sensor, models["paper"])
     noises = {**models, REAL: sensor.fitted_darks, SHUFFLED: shuffled(sensor.fitted_darks)}
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in noises}
+    found: dict[str, list[Scored]] = {name: [] for name in noises}
     for seed, (train, kept) in enumerate(folds):
         shown = [clip for clip in kept if not clip.is_long]
         for name, noise in noises.items():
-            path = trained(camera, name, noise, train, seed, options)
-            found[name].append(measured(sensor, path, camera, shown, options.places))
+            path = trained(kind, camera, name, noise, train, seed, options)
+            found[name].append(measured(sensor, kind.video(path, camera), camera, shown, options.places))
     return found
 
 
@@ -276,6 +223,7 @@ def main(argv: list[str] | None = None) -> None:
     add = parser.add_argument
     add("--clips", type=Path, help="folder of clean clips (default: scikit-image's pictures)")
     add("--sensors", help="separated by commas")
+    add("--networks", help=f"of {', '.join(NETWORKS)}, separated by commas")
     add("--seeds", type=int, help="trainings with each noise; each holds out different clips")
     add("--minutes", type=float, help="of `improve`, for each sensor")
     add("--steps", type=int, help="steps of each training")
@@ -293,9 +241,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.set_defaults(**tomllib.loads(SETTINGS.read_text()))
     options = parser.parse_args(argv)
     folder = Path(os.environ.get("HSNOISE_SHARED", "../shared")) / "data"
-    known, asked = sensors(folder), options.sensors.split(",")
+    known, asked, networks = sensors(folder), options.sensors.split(","), options.networks.split(",")
     if not folder.is_dir() or set(asked) - set(known):
         parser.error(f"--sensors: expected some of {', '.join(known)}, with their data in {folder}")
+    if set(networks) - set(NETWORKS):
+        parser.error(f"--networks: expected some of {', '.join(NETWORKS)}, got {options.networks}")
     if options.seeds < 2:
         parser.error(f"--seeds: expected at least 2, because trainings scatter; got {options.seeds}")
     if not 0 <= options.jitter <= 1:
@@ -314,13 +264,21 @@ def main(argv: list[str] | None = None) -> None:
     if len({clip.source for _, kept in folds for clip in kept}) < 2:
         parser.error("--clips, --seeds: expected at least two held-out videos, for an error over clips")
     options.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, dict[str, list[dict[str, float]]]] = {}
+    results: dict[str, dict[str, dict[str, list[Scored]]]] = {network: {} for network in networks}
     for name in asked:
-        results[name] = judged(known[name](), folds, options)
-        sheet = table_of(results)
+        sensor = known[name]()
+        for network in networks:
+            results[network][name] = judged(NETWORKS[network], sensor, folds, options)
+        write_results(results, options.out)
+
+
+def write_results(results: dict[str, dict[str, dict[str, list[Scored]]]], out: Path) -> None:
+    """ablation.md and ablation.json of what is done by now; the tables are printed."""
+    sheets = [table_of(picked(of, score), score, network) for network, of in results.items() for score in SCORES if of]
+    for sheet in sheets:
         Console(width=180).print(sheet.rich())
-        write_atomically(options.out / "ablation.md", sheet.markdown().encode())
-        write_atomically(options.out / "ablation.json", json.dumps(results).encode())
+    write_atomically(out / "ablation.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
+    write_atomically(out / "ablation.json", json.dumps(results).encode())
 
 
 if __name__ == "__main__":

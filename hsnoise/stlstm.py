@@ -215,15 +215,18 @@ class STLSTM(eqx.Module):
                 f" {expected}; make one with init_state"
             )
 
-    def video(self, frames: jax.Array, *, state: State | None = None, checkpoint: bool = False) -> jax.Array:
+    def video(
+        self, frames: jax.Array, *, state: State | None = None, checkpoint: bool = False, unroll: int = 1
+    ) -> jax.Array:
         """All frames [time, batch, row, column, channel], enhanced one after the other.
 
         state: from which they go on, such as that of `after`; None: an empty one; checkpoint: recompute the inside of
-        each frame for the gradient, which takes a third of the memory.
+        each frame for the gradient, which takes a third of the memory; unroll: frames compiled into one piece, which a
+        GPU runs faster and takes longer to compile.
         """
         step = jax.checkpoint(_step) if checkpoint else _step
         state = self.init_state(frames.shape[2:4], frames.shape[1]) if state is None else state
-        _, out = jax.lax.scan(lambda state, frame: step(self, frame, state), state, frames)
+        _, out = jax.lax.scan(lambda state, frame: step(self, frame, state), state, frames, unroll=unroll)
         return out
 
     def after(self, frames: jax.Array) -> State:

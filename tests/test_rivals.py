@@ -14,7 +14,8 @@ import numpy as np
 import optax
 import pytest
 
-from benchmarks.networks import RIVALS, main, tables
+from benchmarks._network_scores import tables
+from benchmarks.networks import OURS, RIVALS, Budget, main
 from benchmarks.rivals.fastdvdnet import STRIDE
 from benchmarks.rivals.kpn import BURST, KERNEL, filtered
 from benchmarks.rivals.layers import Noise, displayed_with_noise, noise_map_of
@@ -220,12 +221,22 @@ def test_fastdvdnet_shares_triples_as_separate_windows_would():
 
 def test_differences_are_paired_over_clips():
     def result(values):
-        clips = {name: dict.fromkeys(("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled"), v) for name, v in values}
-        return {"parameters": 1, "steps": 2, "minutes": 1.0, "rate": 0.1, "clips": clips}
+        scores = ("psnr_db", "ssim", "psnr_scaled_db", "ssim_scaled")
+        # Two frames of each clip, whose mean counts.
+        frames = [{"clip": name} | dict.fromkeys(scores, v + by) for name, v in values for by in (-1.0, 1.0)]
+        return {"parameters": 1, "steps": 2, "minutes": 1.0, "rate": 0.1, "frames": frames}
 
-    own, apart = tables({"ST-LSTM": result([("a", 20.0), ("b", 30.0)]), "KPN": result([("a", 18.0), ("b", 28.0)])})
+    of = {OURS: result([("a", 20.0), ("b", 30.0)]), "KPN": result([("a", 18.0), ("b", 28.0)])}
+    own, apart = tables(of, OURS)
     assert own.rows[0][5] == "25.00 +- 5.00"
     assert apart.rows == [("ST-LSTM - KPN", "+2.00 +- 0.00", "+2.000 +- 0.000", "+2.00 +- 0.00", "+2.000 +- 0.000")]
+
+
+def test_a_training_ends_with_its_steps_or_its_minutes():
+    assert Budget(None, 4).used(2, 100.0) == 0.5
+    assert Budget(10.0, None).used(2, 5.0) == 0.5
+    assert Budget(10.0, 4).used(1, 5.0) == 0.5 and Budget(10.0, 4).used(3, 5.0) == 0.75
+    assert Budget(6.0, 4).part(0.5) == Budget(3.0, 2)
 
 
 def test_width_must_be_positive():
@@ -236,7 +247,8 @@ def test_width_must_be_positive():
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--steps", "0"], "--minutes, --steps: expected more than 0, got 10.0, 0"),
+        (["--steps", "0"], "--steps: expected more than 0, got 0"),
+        (["--minutes", "nan"], "--minutes: expected more than 0, got nan"),
         (["--crop", "32"], "at least 64, got 0.25, 4, 32"),
         (["--rates", "-1"], "--rates: expected above 0, got [-1.0]"),
         ([], "--clips: expected a folder"),
@@ -262,9 +274,13 @@ def test_the_command_trains_scores_and_keeps_what_is_finished(tmp_path, capsys):
     first = capsys.readouterr().out
     assert "FFDNet: " in first and "6 steps" in first and "| FFDNet |" in (out / "networks.md").read_text()
     found = json.loads(next(out.glob("*.json")).read_text())
-    assert set(found["clips"]) == {"c"} and found["steps"] == 6 and found["parameters"] > 0
+    assert {record["clip"] for record in found["frames"]} == {"c"} and found["steps"] == 6 and found["parameters"] > 0
+    assert (out / "networks.csv").read_text().count("FFDNet,c,") == len(found["frames"]) == 5 * 8
+    assert len(list((out / "FFDNet").glob("c-*e.png"))) == 5
     next(out.glob("*.json")).unlink()  # the scores, as if interrupted before them
     main(command)
     again = capsys.readouterr().out
     assert "steps" not in again.split("Held-out")[0]
-    assert json.loads(next(out.glob("*.json")).read_text())["clips"] == found["clips"]
+    assert json.loads(next(out.glob("*.json")).read_text())["frames"] == found["frames"]
+    main([*command, "--noise", "gaussian"])
+    assert "FFDNet, gaussian noise" in (out / "networks.md").read_text()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -12,7 +14,8 @@ import numpy as np
 import pytest
 
 import hsnoise
-from benchmarks import noise_ablation
+from benchmarks import _ablation_tables, noise_ablation
+from benchmarks._ablation_networks import NETWORKS
 from benchmarks.evaluate import main as run_evaluate
 from benchmarks.train import main as run_train
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
@@ -390,12 +393,32 @@ def test_the_ablation_is_told_with_an_error_over_clips_and_seeds():
 
     of = {"gaussian": moved(-1), "poisson-gaussian": base, "paper": moved(1), "improved": moved(2)}
     of |= {noise_ablation.REAL: moved(4), noise_ablation.SHUFFLED: base}
-    text = noise_ablation.table_of({"imx541": of}).markdown()
+
+    def told(of):
+        return _ablation_tables.table_of({"imx541": of}, "psnr_db", "st-lstm").markdown()
+
+    text = told(of)
     over_clips = np.std([0.9, 1.3, 1.1, 1.5], ddof=1) / 2
-    assert f"| +1.20 +- {over_clips:.2f} dB |" in text and "| 23.00 | 24.20 |" in text
+    assert f"| +1.20 +- {over_clips:.2f} |" in text and "| 23.00 | 24.20 |" in text
     assert "| 50 +- 0 % |" in text
-    assert "no gap beyond chance" in noise_ablation.table_of({"imx541": of | {noise_ablation.REAL: base}}).markdown()
+    assert "no gap beyond chance" in told(of | {noise_ablation.REAL: base})
     # Trainings that differ by more than clips do count; a clip that two of them saw counts once.
-    mean, error = noise_ablation.gain_of([{"a": 1.0, "b": 1.2}, {"a": 2.0, "b": 2.2}])
+    mean, error = _ablation_tables.gain_of([{"a": 1.0, "b": 1.2}, {"a": 2.0, "b": 2.2}])
     assert (mean, error) == pytest.approx((1.6, np.hypot(0.1, 0.5)))
-    assert noise_ablation.gain_of([{"a": 1.0, "b": 1.4}])[1] == pytest.approx(0.2)
+    assert _ablation_tables.gain_of([{"a": 1.0, "b": 1.4}])[1] == pytest.approx(0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", NETWORKS)
+def test_both_networks_of_the_ablation_learn_from_drawn_and_real_darks(tmp_path, rng, network):
+    kind, camera = NETWORKS[network], mono_camera((4.0, 40.0))
+    camera = replace(camera, model=camera.model.add(DarkCurrent(1.0)))
+    options = argparse.Namespace(steps=3, maps=2, stride=4, side=32, jitter=0.0, out=tmp_path)
+    clips = [Clip("even", rng.integers(90, 190, (8, 40, 40, 3)).astype(np.uint8))]
+    darks = np.asarray(hsnoise.sample_dark(jax.random.key(0), 8, (40, 50), camera.model), float)
+    sensor = noise_ablation.Sensor("sensor", None, darks, 0.1)
+    for name, noise in (("paper", camera.model), (noise_ablation.REAL, darks)):
+        path = noise_ablation.trained(kind, camera, name, noise, clips, 0, options)
+        assert path == noise_ablation.trained(kind, camera, name, noise, clips, 0, options)  # kept
+        scores = noise_ablation.measured(sensor, kind.video(path, camera), camera, clips, 1)["even"]
+        assert scores["psnr_scaled_db"] >= scores["psnr_db"] - 0.01 and 0 < scores["ssim_scaled"] < 1
