@@ -53,6 +53,7 @@ DIM, BRIGHT = 0.4, 1.6  # photoelectrons of the average, in standard deviations 
 BATCH, FRAMES, CROP = 4, 8, 128
 NEAR = 3.0  # standard deviations
 MATCH_SIDE = 256
+ON_DARKS = "light on darks is not rounded"  # kept with the weights' names: others were trained differently
 Scored = dict[str, dict[str, float]]  # {clip: {score: value}}
 
 
@@ -108,6 +109,7 @@ def trained(
     if darks is None:
         camera = levelled(camera, level_of(drawn_darks(model)))
     sizes = (options.stride, options.side, options.jitter, camera.sensor, camera.mean_e, PROTOCOL)
+    sizes += () if darks is None else (ON_DARKS,)
     what = digest_of(noise, camera.model, [clip.frames for clip in clips], *sizes)[:8]
     path = options.out / f"{kind.prefix}{camera.name}-{name}-{options.maps}-{options.steps}-{seed}-{what}.eqx"
     if path.exists():
@@ -150,7 +152,8 @@ def on_darks(light: np.ndarray, white_e: float, darks: np.ndarray, camera: Camer
     order = rng.permutation(np.arange(max(n, len(darks))) % len(darks))[:n]
     dark = darks[order, row : row + rows, column : column + columns]
     gain = float(np.mean(np.asarray(camera.model["gain"].value)))
-    counts = np.rint(dark + gain * rng.poisson(light[..., 0] * white_e))
+    # Darks have been rounded already. Twice, and single photoelectrons would vanish at a gain below 0.5 DN/e-.
+    counts = dark + gain * rng.poisson(light[..., 0] * white_e)
     return np.asarray(electrons_of(counts, camera.model), np.float32) / camera.unit_e
 
 

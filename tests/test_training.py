@@ -351,6 +351,16 @@ def test_real_darks_train_as_drawn_ones_do(rng):
     assert not np.array_equal(mixed, darks)
 
 
+def test_dim_light_on_real_darks_stays_linear(rng):
+    """Where the gain is below 0.5 DN/e-, light that is rounded by itself would lose single photoelectrons."""
+    camera = mono_camera((1.0, 1.0))
+    darks = np.rint(10 + 0.3 * rng.standard_normal((2, 60, 60)))
+    gain, mean_e = float(camera.model["gain"].value[0]), 0.3
+    noisy = noise_ablation.on_darks(np.ones((2, 60, 60, 1)), mean_e, darks, camera, rng)
+    expected = mean_e + (darks.mean() - 10) / gain
+    assert float(noisy.mean()) * camera.unit_e == pytest.approx(expected, abs=4 * np.sqrt(mean_e / noisy.size))
+
+
 @pytest.mark.slow
 def test_light_is_added_to_real_dark_frames():
     camera = mono_camera()
