@@ -31,7 +31,9 @@ from hsnoise.criticism.measured_noise import (
     with_distribution,
     with_hits,
     with_read_noise,
+    with_shot_noise,
     with_spectra,
+    with_spread,
 )
 from hsnoise.criticism.shares import Share
 from hsnoise.effects import Stage
@@ -58,7 +60,7 @@ class ClosedModel:
         params: the NoiseModel, for `hsnoise.sample`, `save`, ...
         named: the model that was closed.
         replaced: its effects that the maps of this sensor, the distribution and the hits stand for.
-        overshot: its effects that drew more than there is, so that the spectra were measured whole.
+        overshot: its effects that drew more than there is, in whose place the spectra were measured whole.
         shares: of each component of the noise budget, explained by names or only by measured components.
         static: a sentence on the effects that are most of the static variance.
         comparison: with frames that it was not made from, or with those that it was made from if there are no others;
@@ -126,7 +128,12 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     judging = darks if held_out is None else repeated_darks(held_out)
     judge = Portion.of(judging if flats is None else with_flats(judging, flats))
     with jax.enable_x64(True):
-        models = _Closing.of(darks, params, seed).with_light(params, stack, flats)
+        closing = _Closing.of(darks, params, seed)
+        models = [closing.nearer(start) for start in closing.starts(params)]
+    if len(models) > 1:
+        models = [min(models, key=lambda model: compared(model, judge.darks, seed=seed).total)]
+    with jax.enable_x64(True):
+        models = closing.with_light(models[0], stack, flats)
     found, comparison = _nearest(models, judge, seed)
     key = key_for(seed, Purpose.SHARES)
     gone = [effect for effect in params if effect.name not in found]
@@ -199,25 +206,33 @@ class _Closing:
         words = np.asarray(jax.random.bits(named_key(key, "maps"), (4,), np.uint32))
         return _Closing(darks, Sensor(_apart(darks, model), np.random.default_rng(words), darks.window), key)
 
-    def closed(self, model: NoiseModel) -> NoiseModel:
-        """The model with maps in place of patterns, then brought nearer draw by draw."""
+    def starts(self, model: NoiseModel) -> list[NoiseModel]:
+        """The model with maps in place of patterns; and without effects that overshoot, where there are any.
+
+        A spectrum has the right power, but not the phase of what stands still, as rows that are read together do.
+        """
         for effect in [one for one in model if one.measurable]:
             model = model.remove(effect.name)
-        model = self.named_that_hold(with_hits(self.sensor.with_map(model), self.sensor))
+        model = with_hits(self.sensor.with_map(model), self.sensor)
+        holding = self.named_that_hold(model)
+        return [model] if holding is model else [holding, model]
+
+    def nearer(self, model: NoiseModel) -> NoiseModel:
+        """The model brought nearer draw by draw."""
         for number in range(ROUNDS):
             drawn = self.drawn(model, number)
             before, model = mean_power(model), with_spectra(model, self.sensor.seen, drawn)
             model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
+            model = with_spread(with_shot_noise(model, self.sensor, drawn), self.sensor, drawn)
             if number == 0:
                 model = with_distribution(model, self.sensor)
         return model
 
-    def with_light(self, named: NoiseModel, stack: FrameStack, flats: FrameStack | None) -> list[NoiseModel]:
+    def with_light(self, model: NoiseModel, stack: FrameStack, flats: FrameStack | None) -> list[NoiseModel]:
         """The closed model with what flats tell; two where they show a bent response, which may be that of the lamp.
 
         flats: those of `stack` that can be compared; without any, a bent response is taken for the sensor's.
         """
-        model = self.closed(named)
         bent = with_response(model, stack)
         if flats is None:
             return [bent]

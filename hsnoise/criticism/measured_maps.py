@@ -12,7 +12,7 @@ from hsnoise._core.types import Window, cfa_tile, channel_index
 from hsnoise.effects import MeasuredMap
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
-from hsnoise.statistics.apart import CORE_SIGMAS, Apart, core_sigma
+from hsnoise.statistics.apart import CORE_SIGMAS, ORDINARY, Apart, core_sigma
 from hsnoise.statistics.pixels.shrinking import values_from_posterior, variances_from_posterior
 from hsnoise.statistics.spectra import periodogram, series_from_posterior
 
@@ -21,6 +21,7 @@ LEAST_READ_DN2 = 0.01  # read noise that is lost in rounding
 LEAST_SHARE = 0.05  # of the usual read noise, of the quietest pixel
 SHORT = 0.25  # of the longest exposure: below, noise is read noise
 HOT_TIMES = 3.0  # times the usual dark current, beyond which a pixel is hot
+LINES_DIFFER = 5.0  # errors by chance beyond which lines differ in noise
 LOWEST = 0.02  # share of the pixels with the least dark current, which counts as none where it comes out negative
 
 
@@ -72,7 +73,7 @@ class Sensor:
         read, fluctuation = self._noise(charge, gain)
         if not self.grows and "dark_current" in model:  # the fit's dark current stays, and is in the level
             offset -= gain * float(model["dark_current"].rate) * self.exposure_s[0]
-        maps = {"offset": offset - black_level_of(model)[channel], "read_noise": _of_mean_square_one(read / gain)}
+        maps = {"offset": offset - black_level_of(model)[channel], "read_noise": of_mean_square_one(read / gain)}
         if self.grows and "dark_current" in model:
             rate = charge / gain
             model = model.with_value("dark_current", "rate", rate.mean())
@@ -129,15 +130,16 @@ class Sensor:
 
     def _noise(self, growth: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Read noise of each pixel, DN, and the relative change of its dark current from frame to frame."""
-        variance, exposure_s, dof = _pooled(self.short)
+        variance, exposure_s, dof = pooled(self.short)
         shot = gain * growth * exposure_s
         usual = max(float(np.median(variance - shot)) * dof / chi2.median(dof) - ROUNDING, LEAST_READ_DN2)
         expected = usual + shot + ROUNDING
+        expected = expected * _noise_of_lines(variance / expected)
         own = expected * variances_from_posterior(variance / expected, dof, self.rng) - shot - ROUNDING
         own = np.maximum(own, LEAST_SHARE * usual)
         if not self.long:
             return np.sqrt(own), np.zeros_like(own)
-        variance, exposure_s, dof = _pooled(self.long)
+        variance, exposure_s, dof = pooled(self.long)
         dark = growth * exposure_s
         expected = own + gain * dark + ROUNDING
         beyond = expected * (variances_from_posterior(variance / expected, dof, self.rng) - 1)
@@ -145,11 +147,29 @@ class Sensor:
         return np.sqrt(own), np.where(is_hot, np.sqrt(np.maximum(beyond, 0)) / np.where(is_hot, dark, 1), 0).clip(0, 1)
 
 
-def _of_mean_square_one(values: np.ndarray) -> np.ndarray:
+def _noise_of_lines(ratio: np.ndarray) -> np.ndarray:
+    """How much noisier rows and columns are than usual [row, column], by the variances of their pixels.
+
+    A line has a thousand pixels: what they share is known far better than any of them, and would be lost in a draw of
+    each pixel by itself.
+    """
+    usual = np.minimum(ratio, np.quantile(ratio, ORDINARY))
+    found = np.ones_like(ratio)
+    for axis in (0, 1):
+        across = usual.mean(1 - axis, keepdims=True)
+        error = float(np.mean(usual.var(1 - axis))) / usual.shape[1 - axis]
+        beyond = float(across.var()) - error
+        if beyond > LINES_DIFFER * error * np.sqrt(2 / usual.shape[axis]):
+            share = beyond / (beyond + error)
+            found = found * (1 + share * (across / across.mean() - 1))
+    return found
+
+
+def of_mean_square_one(values: np.ndarray) -> np.ndarray:
     return values / np.sqrt(np.mean(values**2))
 
 
-def _pooled(parts: Sequence[Apart]) -> tuple[np.ndarray, float, int]:
+def pooled(parts: Sequence[Apart]) -> tuple[np.ndarray, float, int]:
     """Temporal variance of each pixel over some exposures, their mean exposure, and its degrees of freedom."""
     dof = np.array([one.n_frames - 1 for one in parts])
     variance = sum(d * one.variance for d, one in zip(dof, parts, strict=True)) / dof.sum()

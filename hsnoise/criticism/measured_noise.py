@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import numpy as np
 from scipy.optimize import nnls
 
-from hsnoise.criticism.measured_maps import LEAST_READ_DN2, Sensor
+from hsnoise._core.types import channel_index
+from hsnoise.criticism.measured_maps import LEAST_READ_DN2, Sensor, of_mean_square_one, pooled
 from hsnoise.effects import AbstractEffect, Capture, MeasuredDistribution, MeasuredHits, MeasuredSpectrum
 from hsnoise.effects.measured_distribution import knots, moments_of, normalised
 from hsnoise.model import NoiseModel
 from hsnoise.statistics.apart import Apart, core_sigma
 from hsnoise.statistics.deconvolution import quantiles_beside_normal
+from hsnoise.statistics.pixels.shrinking import CORE
 from hsnoise.statistics.spectra import not_negative, smoothed
 
 KNOTS = 512
@@ -21,6 +24,8 @@ BANDS = 8  # of a spectrum, in which a named effect must not overshoot
 ALLOWED = 2.0  # by which a named effect's chi-square may exceed that of none
 NORMAL_SHARE = 0.8  # of the variance of the core that stays normal: the smoother, the smaller
 CORRELATED = 5.0  # errors by chance beyond which neighbours in a row are correlated
+SPREAD_MOVES = (0.25, 4.0)  # least and most factor of the variance of a map's logarithms in a round
+WIDTHS = 2.0  # of a map's logarithms, within which pixels move
 MOST_OF_READ = 0.95  # of the read noise that need not be normal
 ADDS_TO = {"row": "row_x_frame", "column": "column_x_frame", "frame": "frame"}
 GAINS = ("row_gain", "shared_row_gain")  # of rows: they make rows differ in noise
@@ -112,6 +117,52 @@ def with_read_noise(model: NoiseModel, sensor: Sensor, drawn: Sequence[Apart], s
     total = max(read + other + (np.mean(lacking) - spared_dn2) / square, LEAST_READ_DN2 / square)
     share = other / (read + other) if read + other > 0 else 0.0
     return _divided(model, total, share)
+
+
+def with_shot_noise(model: NoiseModel, sensor: Sensor, drawn: Sequence[Apart]) -> NoiseModel:
+    """The model whose dark current makes long exposures as noisy as they are; the levels of its pixels stay.
+
+    What the levels grow by need not be charge: the pedestal may move with the exposure, and hot pixels may be quieter
+    than Poisson's law.
+    """
+    whole, long, t = model["measured_map"], ~sensor.is_short, sensor.exposure_s
+    if whole.dark_current is None or not long.any():
+        return model
+    gain = np.asarray(model["gain"].value)
+    pairs = zip(sensor.seen, drawn, strict=True)
+    lacking = np.array([one.ordinary_variance() - of.ordinary_variance() for one, of in pairs])
+    lacking -= lacking[~long].mean()  # which read noise makes up for
+    charge = float(model["dark_current"].rate) * np.asarray(whole.dark_current, np.float64)
+    found = np.maximum(charge + float(lacking[long] @ t[long] / (t[long] @ t[long])) / float(np.mean(gain**2)), 0)
+    if not found.any():
+        return model
+    growth = (charge - found) * gain[channel_index(model.cfa, found.shape)]
+    growth = growth + (0.0 if whole.growth is None else np.asarray(whole.growth))
+    fields = (found / found.mean()).astype(np.float32), growth.astype(np.float32)
+    whole = eqx.tree_at(lambda of: (of.dark_current, of.growth), whole, fields, is_leaf=lambda of: of is None)
+    return model.with_value("dark_current", "rate", found.mean()).add(whole)
+
+
+def with_spread(model: NoiseModel, sensor: Sensor, drawn: Sequence[Apart]) -> NoiseModel:
+    """The model whose map of read noise differs between pixels by what measured variances do, and drawn ones do not."""
+    short = [of for of, is_short in zip(drawn, sensor.is_short, strict=True) if is_short]
+    read = np.log(np.asarray(model["measured_map"].read_noise, np.float64))
+    seen, found = (_width(np.log(np.maximum(pooled(of)[0], LEAST_READ_DN2))) for of in (sensor.short, short))
+    lacking = seen**2 - found**2
+    own = _width(read)
+    if own <= 0:
+        return model
+    factor = np.sqrt(np.clip(1 + lacking / (2 * own) ** 2, *SPREAD_MOVES))  # a variance is twice as wide
+    # The noisiest and the quietest pixels are measured well, and keep their distance.
+    core = np.clip(read - np.median(read), -WIDTHS * own, WIDTHS * own)
+    read = of_mean_square_one(np.exp(read + (factor - 1) * core))
+    return model.add(eqx.tree_at(lambda of: of.read_noise, model["measured_map"], read.astype(np.float32)))
+
+
+def _width(values: np.ndarray) -> float:
+    """Half of the distance of the quantiles at one standard deviation."""
+    low, high = np.quantile(values, CORE[::2])
+    return float(high - low) / 2
 
 
 def _divided(model: NoiseModel, total_e2: float, share: float) -> NoiseModel:

@@ -9,6 +9,7 @@ likelihood (Laird, "Nonparametric maximum likelihood estimation of a mixing dist
 from __future__ import annotations
 
 import numpy as np
+from scipy.fft import dctn, idctn
 from scipy.ndimage import zoom
 from scipy.stats import chi2
 
@@ -26,12 +27,38 @@ CORE = (0.1587, 0.5, 0.8413)  # quantiles at one standard deviation
 
 def surroundings(values: np.ndarray) -> np.ndarray:
     """The smooth part of a map [row, column]: medians of blocks, interpolated."""
+    return _interpolated(_medians(values), values.shape)
+
+
+def _medians(values: np.ndarray) -> np.ndarray:
     blocks = values
     for axis, size in enumerate(values.shape):
         parts = np.array_split(blocks, max(1, size // BLOCK), axis=axis)
         blocks = np.concatenate([np.median(part, axis=axis, keepdims=True) for part in parts], axis=axis)
-    factors = [size / of for size, of in zip(values.shape, blocks.shape, strict=True)]
+    return blocks
+
+
+def _interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    factors = [size / of for size, of in zip(shape, blocks.shape, strict=True)]
     return zoom(blocks, factors, order=1, mode="nearest", grid_mode=True)
+
+
+def surroundings_from_posterior(estimate: np.ndarray, halves: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The smooth part of a map [row, column] drawn from its posterior, scale by scale; its mean stays.
+
+    halves [half, row, column]: as in `values_from_posterior`.
+    """
+    blocks = _medians(estimate)
+    power = dctn(blocks, norm="ortho")
+    one, two = (dctn(_medians(half), norm="ortho") for half in halves)
+    scale = np.ceil(np.log2(1 + np.hypot(*np.indices(power.shape)))).astype(int)  # octaves of cycles over the map
+    counts = np.bincount(scale.ravel())
+    prior, error = (np.bincount(scale.ravel(), of.ravel()) / counts for of in (one * two, (one - two) ** 2 / 4))
+    share = (np.maximum(prior, 0) / (np.maximum(prior, 0) + error + TINY))[scale]
+    share[0, 0] = 1.0
+    noise = rng.standard_normal(power.shape) * np.sqrt(share * error[scale])
+    noise[0, 0] = 0.0
+    return _interpolated(idctn(share * power + noise, norm="ortho"), estimate.shape)
 
 
 def values_from_posterior(
@@ -58,7 +85,7 @@ def values_from_posterior(
     middle = (edges[1:] + edges[:-1]) / 2
     drawn = _drawn(local / sigma, edges, grid, -0.5 * (middle[:, None] - grid) ** 2, first, rng)
     found = estimate.copy()
-    found[is_near] = even[is_near] + sigma * drawn
+    found[is_near] = surroundings_from_posterior(estimate, halves, rng)[is_near] + sigma * drawn
     return found
 
 
