@@ -91,6 +91,49 @@ def test_it_saves_loads_and_compares(wild, tmp_path):
     assert hsnoise.compare(again, held_out, draws=8).error < 20 < hsnoise.compare(wild.named, held_out, draws=8).error
 
 
+def drawn_darks(model, frames, shape, exposures_s, key=5):
+    """Darks of this model."""
+    blank = [np.arange(frames * shape[0] * shape[1], dtype=np.uint16).reshape(frames, *shape) % 251] * len(exposures_s)
+    like = hsnoise.FrameStack(blank, exposures_s, cfa=model.cfa, shutter=model.shutter)
+    return draw_capture(key, model, like)
+
+
+def test_noisy_rows_stay_noisy_and_pixels_differ_no_more_than_they_do():
+    """A row is known far better than its pixels, which a draw of each pixel by itself would hide."""
+    own = fx.ReadNoiseNonuniformity(0.1, row_spread=0.15)
+    darks = drawn_darks(model_of(*BASE, own), 6, (96, 160), (0.0,))
+    found = np.log(closed(model_of(*BASE, own), darks).params["measured_map"].read_noise)
+    seen = np.log(darks.counts[0].astype(float).var(0, ddof=1)).mean(1) / 2
+    assert np.corrcoef(found.mean(1), seen)[0, 1] > 0.9
+    assert found.mean(1).std() == pytest.approx(0.15, abs=0.03)
+    assert (found - found.mean(1, keepdims=True)).std() == pytest.approx(0.1, abs=0.04)
+
+
+@pytest.mark.slow
+def test_rows_that_are_read_together_are_no_spectrum():
+    """Named 20 % too strong, they are kept: a spectrum has their power, but rows of a group would part."""
+    groups = fx.RowGroupNoise(2.0, rows=8, start=3)
+    darks = drawn_darks(model_of(*BASE, groups), 8, (128, 160), (0.0,))
+    found = closed(model_of(*BASE, fx.RowGroupNoise(2.4, rows=8, start=3)), darks)
+    assert found.overshot == () and "row_group_noise" in found.params
+    assert found.comparison.groups["row x frame"] < 12
+
+
+@pytest.mark.parametrize("charge", [0.0, 20.0])
+def test_a_level_that_rises_is_as_noisy_as_its_charge(charge):
+    """Pixels gain 30 e-/s by what makes shot noise, or by a pedestal that moves with the exposure."""
+    base = [fx.ShotNoise(), fx.DarkCurrent(charge), fx.ReadNoise(4.0), fx.Gain(1.5), fx.BlackLevel(100.0), fx.ADC()]
+    rising = fx.MeasuredMap(growth=np.full((96, 160), 1.5 * (30.0 - charge), np.float32))
+    darks = drawn_darks(model_of(*base, rising), 8, (96, 160), (0.0, 4.0))
+    named = [fx.DarkCurrent(30.0) if effect.name == "dark_current" else effect for effect in base]
+    found = closed(model_of(*named), darks).params
+    again = drawn_darks(found, 8, (96, 160), (0.0, 4.0), key=9)
+    for one, other in zip(darks.counts, again.counts, strict=True):
+        one, other = one.astype(float), other.astype(float)
+        assert other.var(0, ddof=1).mean() == pytest.approx(one.var(0, ddof=1).mean(), rel=0.02)
+        assert other.mean() == pytest.approx(one.mean(), abs=0.15)
+
+
 @pytest.mark.slow
 def test_a_bayer_sensor_of_one_exposure():
     seen, held_out = (half.select(exposures=[1]) for half in wild_sensor("RGGB", 8, (96, 128)))
