@@ -28,6 +28,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 from skimage.metrics import structural_similarity
@@ -37,7 +38,7 @@ from benchmarks._ablation_networks import NETWORKS, Kind, Video
 from benchmarks._ablation_sensors import Sensor, sensors
 from benchmarks._ablation_tables import NOISES, REAL, SCORES, SHUFFLED, picked, table_of
 from hsnoise import NoiseModel
-from hsnoise._core.output import write_atomically
+from hsnoise._core.output import write_atomically, write_figure
 from hsnoise.chain.photometry import display_from_linear, light_of_frames
 from hsnoise.cli.progress import busy
 from hsnoise.criticism.improve import improved
@@ -45,7 +46,9 @@ from hsnoise.enhance.mosaic import electrons_of
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, held_out, read_clips
 from hsnoise.enhance.training.noisy import Camera, at_exposure, matched
 from hsnoise.enhance.training.protocol import PROTOCOL, middle_of, scaled_to
+from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.steps import batch_rng, digest_of
+from hsnoise.enhance.training.tables import REFER, draw_frames
 from hsnoise.enhance.training.validation import psnr_db
 
 SETTINGS = Path(__file__).parent / "ablation.toml"
@@ -172,18 +175,21 @@ def real_examples(
     return np.asarray(display_from_linear(linear), np.float32), np.stack(noisy).astype(np.float32)
 
 
-def real_scene(sensor: Sensor, clip: Clip, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def real_scene(
+    sensor: Sensor, clip: Clip, camera: Camera, seed: int, mean_e: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Display values and noisy light in units of the camera [frame, row, column, 1].
 
-    Light that averages E[N_e] over the clip, and its shot noise, on unseen real dark frames. As many frames as there
-    are dark frames; the seed chooses the place on the sensor.
+    Light that averages `mean_e` photoelectrons over the clip (None: somewhere in the range), and its shot noise, on
+    unseen real dark frames. As many frames as there are dark frames; the seed chooses the place on the sensor.
     """
     rng = np.random.default_rng(seed)
     n = min(len(sensor.unseen), len(clip.frames))
     side = min(CROP, *sensor.unseen.shape[1:], *clip.frames.shape[1:3])
     row, column = ((size - side) // 2 for size in clip.frames.shape[1:3])
     light = np.asarray(light_of_frames(clip.frames[:n, row : row + side, column : column + side], 1))
-    noisy = on_darks(light, random_white_e(clip.average, camera, rng), sensor.unseen, camera, rng)
+    white_e = random_white_e(clip.average, camera, rng) if mean_e is None else mean_e / clip.average
+    noisy = on_darks(light, white_e, sensor.unseen, camera, rng)
     return np.asarray(display_from_linear(light), np.float32), noisy.astype(np.float32)
 
 
@@ -205,6 +211,16 @@ def measured(sensor: Sensor, video: Video, camera: Camera, clips: Sequence[Clip]
     return {clip: dict(zip(SCORES, map(float, of), strict=True)) for clip, of in means.items()}
 
 
+def pictured(sensor: Sensor, camera: Camera, clip: Clip, videos: dict[str, Video]) -> Figure:
+    """The last frame of a clip in the middle of the light, on real darks, by networks trained with each noise."""
+    mean_e = middle_of(camera.mean_e)
+    clean, noisy = real_scene(sensor, clip, camera, 0, mean_e)
+    found = {name: of(jnp.asarray(noisy)) for name, of in videos.items()}
+    found = {REFER: np.asarray(display_from_linear(noisy)), **found}
+    scaled = {name: scaled_to(frames, clean) for name, frames in found.items()}
+    return draw_frames(Scene(clip.name, camera, mean_e, mean_e / clip.average, clean, noisy), scaled)
+
+
 def judged(
     kind: Kind, sensor: Sensor, folds: Sequence[tuple[list[Clip], list[Clip]]], options
 ) -> dict[str, list[Scored]]:
@@ -215,9 +231,13 @@ def judged(
     found: dict[str, list[Scored]] = {name: [] for name in noises}
     for seed, (train, kept) in enumerate(folds):
         shown = [clip for clip in kept if not clip.is_long]
-        for name, noise in noises.items():
-            path = trained(kind, camera, name, noise, train, seed, options)
-            found[name].append(measured(sensor, kind.video(path, camera), camera, shown, options.places))
+        paths = {name: trained(kind, camera, name, noise, train, seed, options) for name, noise in noises.items()}
+        videos = {name: kind.video(path, camera) for name, path in paths.items()}
+        for name, video in videos.items():
+            found[name].append(measured(sensor, video, camera, shown, options.places))
+        if seed == 0:
+            picture = pictured(sensor, camera, shown[0], videos)
+            write_figure(options.out / f"{kind.prefix}{sensor.name}.png", picture, dpi=110)
     return found
 
 
