@@ -154,7 +154,8 @@ def with_spread(model: NoiseModel, sensor: Sensor, drawn: Sequence[Apart]) -> No
         return model
     factor = np.sqrt(np.clip(1 + lacking / (2 * own) ** 2, *SPREAD_MOVES))  # a variance is twice as wide
     # The noisiest and the quietest pixels are measured well, and keep their distance.
-    core = np.clip(read - np.median(read), -WIDTHS * own, WIDTHS * own)
+    off = read - np.median(read)
+    core = off * np.exp(-0.5 * (off / (WIDTHS * own)) ** 2)
     read = of_mean_square_one(np.exp(read + (factor - 1) * core))
     return model.add(eqx.tree_at(lambda of: of.read_noise, model["measured_map"], read.astype(np.float32)))
 
