@@ -13,7 +13,7 @@ from hsnoise.effects import MeasuredMap
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
 from hsnoise.statistics.apart import CORE_SIGMAS, ORDINARY, Apart, core_sigma
-from hsnoise.statistics.pixels.shrinking import values_from_posterior, variances_from_posterior
+from hsnoise.statistics.pixels.shrinking import NEAR, values_from_posterior, variances_from_posterior
 from hsnoise.statistics.spectra import periodogram, series_from_posterior
 
 ROUNDING = 1 / 12  # variance of rounding, DN^2
@@ -185,21 +185,27 @@ def _line_means(values: np.ndarray, over: int) -> np.ndarray:
 
 
 def _jointly(estimate: np.ndarray, halves: np.ndarray, covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Quantities of the pixels [quantity, row, column] drawn from their posterior, one after the other.
+    """Quantities of the pixels [quantity, row, column], offset and perhaps growth, drawn from their posterior.
 
-    The one that differs least between pixels comes first: its error is known best, and with it a part of the others'.
+    Instead of the growth, the level at the exposure at which errors are independent of the offset's. The one that is
+    known best comes first, and tells the other what both have in common, such as charge gathered during readout.
     """
-    relative = [
-        core_sigma(x - np.median(x)) / np.sqrt(c) for x, c in zip(estimate, np.diagonal(covariance), strict=True)
-    ]
-    drawn, done = np.empty_like(estimate), []
-    for q in np.argsort(relative):
-        own, left, of_halves = covariance[q, q], estimate[q], halves[:, q]
-        for other in done:
-            slope = covariance[q, other] / covariance[other, other]
-            left = left - slope * (estimate[other] - drawn[other])
-            of_halves = of_halves - slope * (halves[:, other] - drawn[other])
-            own = own - slope * covariance[q, other]
-        drawn[q] = values_from_posterior(left, of_halves, own, rng)
-        done.append(q)
-    return drawn
+    mix = np.eye(len(covariance))
+    if len(mix) == 2:
+        mix[1] = 1.0, -covariance[0, 0] / covariance[0, 1]
+    values, parts = np.tensordot(mix, estimate, 1), np.einsum("ij,hj...->hi...", mix, halves)
+    errors = np.diagonal(mix @ covariance @ mix.T)
+    known = [core_sigma(x - np.median(x)) / np.sqrt(error) for x, error in zip(values, errors, strict=True)]
+    drawn, common = np.empty_like(values), np.zeros_like(values[0])
+    for q in np.argsort(known)[::-1]:
+        drawn[q] = common + values_from_posterior(values[q] - common, parts[:, q] - common, float(errors[q]), rng)
+        common = _slope(values[1 - q], drawn[q]) * drawn[q] if len(mix) == 2 else common
+    return np.tensordot(np.linalg.inv(mix), drawn, 1)
+
+
+def _slope(values: np.ndarray, of: np.ndarray) -> float:
+    """By how much the ordinary pixels of a map [row, column] rise with those of another."""
+    values, of = (x - np.median(x) for x in (values, of))
+    ordinary = (np.abs(values) < NEAR * core_sigma(values)) & (np.abs(of) < NEAR * core_sigma(of))
+    values, of = values[ordinary], of[ordinary]
+    return float(values @ of / (of @ of)) if of.any() else 0.0
