@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.stats import chi2
 
 from hsnoise._core.types import Window, cfa_tile, channel_index
@@ -13,7 +14,7 @@ from hsnoise.effects import MeasuredMap
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
 from hsnoise.statistics.apart import CORE_SIGMAS, ORDINARY, Apart, core_sigma
-from hsnoise.statistics.pixels.shrinking import NEAR, values_from_posterior, variances_from_posterior
+from hsnoise.statistics.pixels.shrinking import NEAR, surroundings, values_from_posterior, variances_from_posterior
 from hsnoise.statistics.spectra import periodogram, series_from_posterior
 
 ROUNDING = 1 / 12  # variance of rounding, DN^2
@@ -187,25 +188,18 @@ def _line_means(values: np.ndarray, over: int) -> np.ndarray:
 def _jointly(estimate: np.ndarray, halves: np.ndarray, covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Quantities of the pixels [quantity, row, column], offset and perhaps growth, drawn from their posterior.
 
-    Instead of the growth, the level at the exposure at which errors are independent of the offset's. The one that is
-    known best comes first, and tells the other what both have in common, such as charge gathered during readout.
+    Drawn are the mixtures of them whose errors, of this covariance, are independent and whose true values are
+    uncorrelated: so what pixels have in common stays, such as charge that they gather while they are read.
     """
-    mix = np.eye(len(covariance))
-    if len(mix) == 2:
-        mix[1] = 1.0, -covariance[0, 0] / covariance[0, 1]
-    values, parts = np.tensordot(mix, estimate, 1), np.einsum("ij,hj...->hi...", mix, halves)
-    errors = np.diagonal(mix @ covariance @ mix.T)
-    known = [core_sigma(x - np.median(x)) / np.sqrt(error) for x, error in zip(values, errors, strict=True)]
-    drawn, common = np.empty_like(values), np.zeros_like(values[0])
-    for q in np.argsort(known)[::-1]:
-        drawn[q] = common + values_from_posterior(values[q] - common, parts[:, q] - common, float(errors[q]), rng)
-        common = _slope(values[1 - q], drawn[q]) * drawn[q] if len(mix) == 2 else common
-    return np.tensordot(np.linalg.inv(mix), drawn, 1)
+    mix = eigh(_true_covariance(estimate, halves), covariance)[1].T  # errors of the mixtures are 1
+    values, parts = np.tensordot(mix, estimate, 1), np.einsum("ij,hj...->ih...", mix, halves)
+    drawn = [values_from_posterior(one, of, 1.0, rng) for one, of in zip(values, parts, strict=True)]
+    return np.tensordot(np.linalg.inv(mix), np.stack(drawn), 1)
 
 
-def _slope(values: np.ndarray, of: np.ndarray) -> float:
-    """By how much the ordinary pixels of a map [row, column] rise with those of another."""
-    values, of = (x - np.median(x) for x in (values, of))
-    ordinary = (np.abs(values) < NEAR * core_sigma(values)) & (np.abs(of) < NEAR * core_sigma(of))
-    values, of = values[ordinary], of[ordinary]
-    return float(values @ of / (of @ of)) if of.any() else 0.0
+def _true_covariance(estimate: np.ndarray, halves: np.ndarray) -> np.ndarray:
+    """Covariance of quantities over ordinary pixels, free of the noise of estimation: one half with the other."""
+    even = np.stack([surroundings(one) for one in estimate])
+    ordinary = [np.abs(one) < NEAR * core_sigma(one) for one in estimate - even]
+    a, b = ((half - even)[:, np.all(ordinary, 0)] for half in halves)
+    return (a @ b.T + b @ a.T) / (2 * max(a.shape[1], 1))
