@@ -15,7 +15,7 @@ import numpy as np
 
 from hsnoise._core.arguments import seed_of
 from hsnoise._core.keys import named_key
-from hsnoise._core.types import RandomKey
+from hsnoise._core.types import RandomKey, cfa_tile
 from hsnoise.criticism import sentences, shares
 from hsnoise.criticism.compare import Comparison, compared
 from hsnoise.criticism.held_out import with_flats
@@ -40,6 +40,7 @@ from hsnoise.effects import Stage
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
+from hsnoise.simulation.defects import MOST, defects
 from hsnoise.simulation.draws import check_fits, draw_capture
 from hsnoise.simulation.portion import Portion, usable_flats
 from hsnoise.simulation.simulator import Purpose, key_for
@@ -126,15 +127,16 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
     darks, flats = repeated_darks(stack), _flats(stack)
     judging = darks if held_out is None else repeated_darks(held_out)
-    judge = Portion.of(judging if flats is None else with_flats(judging, flats))
+    judging = judging if flats is None else with_flats(judging, flats)
+    judge, bad = Portion.of(judging), _defects(judging)
     with jax.enable_x64(True):
         closing = _Closing.of(darks, params, seed)
         models = [closing.nearer(start) for start in closing.starts(params)]
     if len(models) > 1:
-        models = [min(models, key=lambda model: compared(model, judge.darks, seed=seed).total)]
+        models = [min(models, key=lambda model: compared(_sound(model, bad), judge.darks, seed=seed).total)]
     with jax.enable_x64(True):
         models = closing.with_light(models[0], stack, flats)
-    found, comparison = _nearest(models, judge, seed)
+    found, comparison = _nearest(models, judge, bad, seed)
     key = key_for(seed, Purpose.SHARES)
     gone = [effect for effect in params if effect.name not in found]
     replaced = tuple(effect.name for effect in gone if effect.measurable or effect.stage == Stage.LIGHT)
@@ -150,10 +152,25 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     )
 
 
-def _nearest(models: list[NoiseModel], judge: Portion, seed: int) -> tuple[NoiseModel, Comparison]:
+def _nearest(models: list[NoiseModel], judge: Portion, bad: np.ndarray, seed: int) -> tuple[NoiseModel, Comparison]:
     """The model whose flats are nearest to those of `judge`, and its comparison."""
-    found = [(model, compared(model, judge, seed=seed)) for model in models]
+    found = [(model, compared(_sound(model, bad), judge, seed=seed)) for model in models]
     return min(found, key=lambda one: sum(one[1].groups.get(group, 0.0) for group in OF_FLATS.values()))
+
+
+def _defects(stack: FrameStack) -> np.ndarray:
+    """Pixels [row, column] that a comparison leaves out: few that are stuck or dead."""
+    counts = [np.stack(list(stack.frames(i))) for i in range(stack.n_exposures)]
+    bad = defects(counts, stack.kind, len(cfa_tile(stack.cfa)))
+    return bad & (bad.mean() <= MOST)
+
+
+def _sound(model: NoiseModel, bad: np.ndarray) -> NoiseModel:
+    """The model with usual pixels in place of bad ones, for which neighbours stand in where frames are compared."""
+    if not bad.any():
+        return model
+    usual = jax.tree.map(lambda of: np.where(bad, np.median(of), of).astype(of.dtype), model["measured_map"])
+    return model.add(usual)
 
 
 def repeated_darks(stack: FrameStack) -> FrameStack:

@@ -24,11 +24,7 @@ def without_defects(counts: Sequence[np.ndarray], kind: Sequence[str], tile: int
 
     tile: side of a cell of the colour filter, pixels.
     """
-    bad = np.zeros(counts[0].shape[1:], bool)
-    for row in range(tile):
-        for column in range(tile):
-            of_colour = [some[:, row::tile, column::tile] for some in counts]
-            bad[row::tile, column::tile] = _stuck(of_colour) | _dead(of_colour, kind)
+    bad = defects(counts, kind, tile)
     share = bad.mean()
     if not share:
         return list(counts), []
@@ -41,6 +37,16 @@ def without_defects(counts: Sequence[np.ndarray], kind: Sequence[str], tile: int
     for some in out:
         some[:, rows, columns] = some[:, rows, source[rows, columns]]
     return out, [f"{what}, and are no noise: neighbours stood in for them (pixel_map.png of hsnoise fit shows where)"]
+
+
+def defects(counts: Sequence[np.ndarray], kind: Sequence[str], tile: int) -> np.ndarray:
+    """Which pixels [row, column] are stuck or dead, from counts [frame, row, column] of each exposure."""
+    bad = np.zeros(counts[0].shape[1:], bool)
+    for row in range(tile):
+        for column in range(tile):
+            of_colour = [some[:, row::tile, column::tile] for some in counts]
+            bad[row::tile, column::tile] = _stuck(of_colour) | _dead(of_colour, kind)
+    return bad
 
 
 def _stuck(counts: Sequence[np.ndarray]) -> np.ndarray:

@@ -110,6 +110,16 @@ def test_noisy_rows_stay_noisy_and_pixels_differ_no_more_than_they_do():
     assert (found - found.mean(1, keepdims=True)).std() == pytest.approx(0.1, abs=0.04)
 
 
+def test_stuck_pixels_do_not_count_against_a_closed_model():
+    """Neighbours stand in for them where frames are compared; the closed model draws them as they are."""
+    darks = drawn_darks(model_of(*BASE), 6, (96, 160), (0.0,))
+    counts = darks.counts[0].copy()
+    counts[:, 20:90:10, 30:150:20] = 3000
+    stack = darks.with_counts([counts], None)
+    found = closed(model_of(*BASE), stack)
+    assert found.comparison.error < 3 and found.params["measured_map"].offset[20, 30] > 2800
+
+
 @pytest.mark.slow
 def test_rows_that_are_read_together_are_no_spectrum():
     """Named 20 % too strong, they are kept: a spectrum has their power, but rows of a group would part."""
