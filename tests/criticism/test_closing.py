@@ -110,16 +110,6 @@ def test_noisy_rows_stay_noisy_and_pixels_differ_no_more_than_they_do():
     assert (found - found.mean(1, keepdims=True)).std() == pytest.approx(0.1, abs=0.04)
 
 
-def test_stuck_pixels_do_not_count_against_a_closed_model():
-    """Neighbours stand in for them where frames are compared; the closed model draws them as they are."""
-    darks = drawn_darks(model_of(*BASE), 6, (96, 160), (0.0,))
-    counts = darks.counts[0].copy()
-    counts[:, 20:90:10, 30:150:20] = 3000
-    stack = darks.with_counts([counts], None)
-    found = closed(model_of(*BASE), stack)
-    assert found.comparison.error < 3 and found.params["measured_map"].offset[20, 30] > 2800
-
-
 @pytest.mark.slow
 def test_rows_that_are_read_together_are_no_spectrum():
     """Named 20 % too strong, they are kept: a spectrum has their power, but rows of a group would part."""
@@ -234,6 +224,17 @@ def test_flats_give_the_response_of_each_pixel(cfa):
     assert np.std(measured.mean(0) - truth.mean(0)) < 0.002 < 0.006 < np.std(truth.mean(0))
     after, before = ({g: x for g, x in one.groups.items() if "flats" in g} for one in (found.comparison, found.before))
     assert max(after.values()) < 4 < 20 < max(before.values()) and "flats, column responses" in after
+
+
+def test_dead_pixels_do_not_count_against_a_closed_model():
+    """Neighbours stand in for them where frames are compared; the closed model draws them as they are."""
+    whole = lit_sensor()
+    counts = [of.copy() for of in whole.counts]
+    for lit, dark in zip(counts[1:], (0, 0, 4), strict=True):
+        lit[:, 20:90:10, 30:120:20] = counts[0][dark : dark + len(lit), 20:90:10, 30:120:20]
+    found = closed(model_of(*BASE, fx.PhotoResponseNonuniformity(0.02)), whole.with_counts(counts, None))
+    assert found.params["measured_map"].photo_response[20, 30] < 0.05
+    assert found.comparison.groups["flats, static pixels"] < 10
 
 
 def test_flats_of_one_frame_leave_the_response_to_its_law():
