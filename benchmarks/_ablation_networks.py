@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,15 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from benchmarks.rivals.layers import noise_map_of
 from benchmarks.rivals.toflow import TOFlow
-from hsnoise._core.keys import named_key
-from hsnoise.enhance.training.clips import Batch
 from hsnoise.enhance.training.noisy import Camera
 from hsnoise.enhance.training.presets import Recipe
-from hsnoise.enhance.training.steps import Trainer, examples
+from hsnoise.enhance.training.steps import Trainer
 from hsnoise.enhance.weights import load_network, read_arrays, save_network, write_arrays
 from hsnoise.model import NoiseModel
 
@@ -63,18 +59,19 @@ class Flow:
 
     prefix = "toflow-"
 
-    def make(self, camera: Camera) -> Callable[[jax.Array], TOFlow]:
-        return partial(TOFlow, noise=noise_map_of(camera), width=WIDTH)
-
     def trainer(self, camera: Camera, noise: NoiseModel, options: argparse.Namespace) -> FlowTrainer:
-        return FlowTrainer(self.make(camera), options.steps, camera, noise, options.jitter)
+        return FlowTrainer(Recipe(rate=RATE), options.steps, camera, noise, jitter=options.jitter)
 
     def save(self, path: Path, net: Any, about: dict[str, Any]) -> None:
         write_arrays(path, net, about)
 
     def video(self, path: Path, camera: Camera) -> Video:
-        net, _ = read_arrays(path, eqx.filter_eval_shape(self.make(camera), jax.random.key(0)))
+        net, _ = read_arrays(path, eqx.filter_eval_shape(_flow_of(camera), jax.random.key(0)))
         return _video_of(net.whole_video)
+
+
+def _flow_of(camera: Camera) -> Callable[[jax.Array], TOFlow]:
+    return partial(TOFlow, noise=noise_map_of(camera), width=WIDTH)
 
 
 def _video_of(enhance: Callable[[jax.Array], jax.Array]) -> Video:
@@ -82,35 +79,14 @@ def _video_of(enhance: Callable[[jax.Array], jax.Array]) -> Video:
     return lambda noisy: np.asarray(of_video(noisy))
 
 
-class FlowTrainer:
-    """TOFlow's training, with the interface of `Trainer`."""
+class FlowTrainer(Trainer):
+    """TOFlow trained as the ST-LSTM is, with a loss of its own."""
 
-    def __init__(
-        self, make: Callable[[jax.Array], TOFlow], steps: int, camera: Camera, noise: NoiseModel, jitter: float
-    ):
-        single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
-        self.make, self.jitter = make, jitter
-        self.camera, self.noise = replace(camera, model=single(camera.model)), single(noise)
-        schedule = optax.cosine_decay_schedule(RATE, steps)
-        self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))  # as `Trainer`
-        self.learn = eqx.filter_jit(partial(_learn, self.optimiser))
-        self._step = eqx.filter_jit(partial(_step, self.optimiser, jitter, camera.sensor))
+    def make(self, key: jax.Array) -> TOFlow:
+        return _flow_of(self.camera)(key)
 
-    def start(self, seed: int) -> tuple[TOFlow, Any]:
-        net = self.make(named_key(jax.random.key(seed), "network"))
-        return net, self.optimiser.init(eqx.filter(net, eqx.is_array))
-
-    def network(self, state: tuple[TOFlow, Any]) -> TOFlow:
-        return state[0]
-
-    def step(self, state: tuple[TOFlow, Any], batch: Batch, seed: int, number: int):
-        key = jax.random.fold_in(named_key(jax.random.key(seed), "noise"), number)
-        light = jnp.asarray(self.camera.mean_e, jnp.float32)
-        return self._step(state, batch, key, self.camera.model, self.noise, light)
-
-
-def _step(optimiser, jitter, sensor, state, batch, key, camera, noise, light):
-    return _learn(optimiser, state, *examples(batch, key, camera, noise, light, jitter, sensor))
+    def learner(self) -> Callable:
+        return partial(_learn, self.optimiser)
 
 
 def _learn(optimiser, state, clean, noisy):

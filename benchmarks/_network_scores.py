@@ -18,7 +18,6 @@ from PIL import Image
 from hsnoise._core.output import write_atomically
 from hsnoise._core.sheet import Sheet
 from hsnoise.enhance.training.evaluate import scores
-from hsnoise.enhance.training.protocol import scaled_to
 from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.tables import as_csv, of_clips, standard_error
 
@@ -26,9 +25,9 @@ DIGITS = {"psnr_db": 2, "ssim": 3, "psnr_scaled_db": 2, "ssim_scaled": 3}
 HEADS = ("PSNR / dB", "SSIM", "PSNR scaled / dB", "SSIM scaled")
 
 
-def scores_of(found: np.ndarray, scene: Scene) -> list[dict[str, Any]]:
+def scores_of(found: np.ndarray, scaled_to_truth: np.ndarray, scene: Scene) -> list[dict[str, Any]]:
     """PSNR and SSIM of each frame of display values, as it is and scaled in brightness to the truth."""
-    as_is, scaled = scores("", scene, np.clip(found, 0, 1)), scores("", scene, scaled_to(found, scene.clean))
+    as_is, scaled = scores("", scene, np.clip(found, 0, 1)), scores("", scene, scaled_to_truth)
     return [
         {name: one[name] for name in ("clip", "mean_e", "frame", "psnr_db", "ssim")}
         | {"psnr_scaled_db": other["psnr_db"], "ssim_scaled": other["ssim"]}

@@ -216,8 +216,9 @@ def tested(method: Method, scenes: Sequence[Scene], shown: Path) -> list[dict[st
     records = []
     for scene in scenes:
         found = method(scene)
-        records += scores_of(found, scene)
-        write_picture(shown / picture_name(scene), scaled_to(found, scene.clean)[-1])
+        scaled = scaled_to(found, scene.clean)
+        records += scores_of(found, scaled, scene)
+        write_picture(shown / picture_name(scene), scaled[-1])
     return records
 
 
@@ -236,12 +237,17 @@ def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     return Setting(camera, *models, noise_map_of(camera), training, validation, *sizes), test
 
 
+def suffix_of(noise: str) -> str:
+    """What the name of a network that was trained with this noise ends with."""
+    return "" if noise == "hsnoise" else f", {noise} noise"
+
+
 def measures(
     setting: Setting, scenes: Sequence[Scene], options: argparse.Namespace
 ) -> dict[str, Callable[[], dict[str, Any]]]:
     """By name of a method, what trains or tunes it if need be and gives its scores; those in `--out` are read."""
     budget = Budget(options.minutes if options.minutes or options.steps else MINUTES, options.steps)
-    noise = "" if options.noise == "hsnoise" else f", {options.noise} noise"
+    noise = suffix_of(options.noise)
 
     def of_network(name: str) -> dict[str, Any]:
         rate = best_rate(setting, name, budget, options.rates, options.crop)
@@ -284,7 +290,7 @@ def run(options: argparse.Namespace) -> None:
     results: dict[str, dict] = {}
     for name, measure in measures(setting, scenes, options).items():
         results[name] = measure()
-        sheets = tables(results, OURS)
+        sheets = tables(results, OURS + suffix_of(options.noise))
         write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
         write_atomically(options.out / "networks.csv", csv_of(results).encode())
     for sheet in sheets:
@@ -319,6 +325,8 @@ def main(argv: list[str] | None = None) -> None:
     for option in ("minutes", "steps"):
         if (value := getattr(options, option)) is not None and not 0 < value < math.inf:
             parser.error(f"--{option}: expected more than 0, got {value:g}")
+    if not (options.networks or options.untrained):
+        parser.error("--networks: expected a network at least, or --untrained")
     if min(options.rates) <= 0:
         parser.error(f"--rates: expected above 0, got {options.rates}")
     if options.width <= 0 or options.crop < SIDE or options.batch < 1:

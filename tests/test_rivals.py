@@ -249,6 +249,7 @@ def test_width_must_be_positive():
     [
         (["--steps", "0"], "--steps: expected more than 0, got 0"),
         (["--minutes", "nan"], "--minutes: expected more than 0, got nan"),
+        (["--networks"], "--networks: expected a network at least, or --untrained"),
         (["--crop", "32"], "at least 64, got 0.25, 4, 32"),
         (["--rates", "-1"], "--rates: expected above 0, got [-1.0]"),
         ([], "--clips: expected a folder"),

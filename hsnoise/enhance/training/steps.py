@@ -55,18 +55,28 @@ class Trainer:
         # Fits use double precision, training does not.
         single = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float32))
         self.recipe, self.camera, self.noise = recipe, replace(camera, model=single(camera.model)), single(noise)
+        self.perceptual = perceptual
         schedule = optax.cosine_decay_schedule(recipe.rate, steps) if recipe.decay else recipe.rate
         self.optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         self.sharding = sharding_of_batches()
-        learn = partial(_learn, self.optimiser, perceptual, recipe)
+        learn = self.learner()
         self._step = eqx.filter_jit(partial(_step, learn, jitter, camera.sensor), donate="none")
         self.learn = eqx.filter_jit(learn, donate="none")
 
+    def make(self, key: jax.Array) -> Any:
+        """The untrained network."""
+        recipe = self.recipe
+        return STLSTM(
+            key, maps=recipe.maps, kernels=recipe.kernels, stride=recipe.stride, channels=self.camera.channels
+        )
+
+    def learner(self) -> Callable:
+        """What takes a state, clean and noisy frames to the next state and the loss."""
+        return partial(_learn, self.optimiser, self.perceptual, self.recipe)
+
     def start(self, seed: int) -> tuple[STLSTM, Any]:
         """The untrained network and its optimiser's state."""
-        recipe = self.recipe
-        key = named_key(jax.random.key(seed), "network")
-        net = STLSTM(key, maps=recipe.maps, kernels=recipe.kernels, stride=recipe.stride, channels=self.camera.channels)
+        net = self.make(named_key(jax.random.key(seed), "network"))
         return net, self.optimiser.init(eqx.filter(net, eqx.is_array))
 
     def network(self, state: tuple[STLSTM, Any]) -> STLSTM:
