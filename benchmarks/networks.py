@@ -9,9 +9,11 @@ three, each tried for a sixth of that time and judged on the split's validation 
 tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained
 on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
 a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained` adds methods that
-need no training, tuned on the first validation clip. Outputs are scored as they are, and scaled in brightness to the
-truth. Finished trainings and scores are kept in `--out`; the same command resumes. `--noise gaussian` trains with
-simpler noise of the same strength; tests have the camera's.
+need no training, tuned on the first validation clip, and the input itself. Outputs are scored as they are, and scaled
+in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes. `--noise
+gaussian` trains with simpler noise of the same strength; tests have the camera's. Tables, scores of each frame
+(networks.csv), their curves (networks.png) and the last frame of each clip (CLIP.png) show all methods that `--out` has
+for the same training, light and clips, those of earlier commands, too.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ import numpy as np
 import optax
 from rich.console import Console
 
+from benchmarks._network_figures import draw_scene, draw_scores
 from benchmarks._network_scores import csv_of, picture_name, scores_of, tables, write_picture
 from benchmarks.rivals.fastdvdnet import FastDVDnet
 from benchmarks.rivals.ffdnet import FFDNet
@@ -40,7 +43,9 @@ from benchmarks.rivals.kpn import KPN
 from benchmarks.rivals.layers import Noise, Rival, noise_map_of
 from benchmarks.rivals.toflow import TOFlow
 from hsnoise._core.keys import named_key
-from hsnoise._core.output import write_atomically
+from hsnoise._core.output import write_atomically, write_figure
+from hsnoise._core.sheet import Sheet
+from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
 from hsnoise.enhance.training.evaluate import Method, prepared
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of, noise_of
@@ -49,6 +54,7 @@ from hsnoise.enhance.training.rivals import Denoiser, rivals
 from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
+from hsnoise.enhance.training.tables import REFER
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import read_arrays, write_arrays
 from hsnoise.model import NoiseModel
@@ -61,6 +67,7 @@ RATES = (3e-4, 1e-3, 3e-3)
 TRIAL = 1 / 6  # of the budget, for each rate
 FRAMES, SIDE = 8, 64
 MAPS, STRIDE = 64, 4  # of the ST-LSTM
+UNROLLED = 4  # of its frames, on a GPU
 LEVELS, TESTED_FRAMES = 5, 10  # 10: all clips have as many, so that networks are compiled once
 SEED = 0
 SPLIT = Path(__file__).parent / "split.toml"
@@ -107,7 +114,7 @@ class Setting:
     """What all trainings share.
 
     model: the camera's, trained_on: that of the noise in training, both in single precision; noise: for noise maps;
-    pieces: of clips in a step; digest: of the camera, its light and all clips.
+    pieces: of clips in a step; digest: of the camera, its light and all clips; noise_digest: of the noise, too.
     """
 
     camera: Camera
@@ -120,13 +127,14 @@ class Setting:
     pieces: int
     out: Path
     digest: str
+    noise_digest: str
 
     def make(self, name: str) -> Callable[[jax.Array], Any]:
         """The network of this name, from a random key."""
         if name in RIVALS:
             return partial(RIVALS[name], noise=self.noise, width=self.width)
         maps = max(1, round(MAPS * self.width))
-        unroll = 1 if jax.default_backend() == "cpu" else FRAMES
+        unroll = 1 if jax.default_backend() == "cpu" else UNROLLED
         return lambda key: Ours(STLSTM(key, maps=maps, stride=STRIDE, channels=self.camera.channels), unroll)
 
     def batch(self, step: int) -> Batch:
@@ -162,7 +170,7 @@ def _enhanced(net, noisy: jax.Array) -> jax.Array:
 
 
 def named(setting: Setting, name: str, budget: Budget) -> str:
-    return f"{name}-{setting.width:g}-{setting.pieces}-{budget}-{setting.digest}"
+    return f"{name}-{setting.width:g}-{setting.pieces}-{budget}-{setting.noise_digest}"
 
 
 def trained(setting: Setting, name: str, rate: float, budget: Budget) -> tuple[Any, dict]:
@@ -231,52 +239,81 @@ def setting_of(options: argparse.Namespace) -> tuple[Setting, list[Clip]]:
     check_sizes([*training, *validation, *test], FRAMES, SIDE)
     options.out.mkdir(parents=True, exist_ok=True)
     models = camera.model, noise_of(options.noise, camera)
-    digest = digest_of(models, camera.mean_e, [clip.frames for clip in (*training, *validation, *test)])[:8]
+    seen = camera.mean_e, [clip.frames for clip in (*training, *validation, *test)]
+    digests = digest_of(camera.model, *seen)[:8], digest_of(models, *seen)[:8]
     models = (jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model) for model in models)
-    sizes = options.width, options.batch, options.out, digest
-    return Setting(camera, *models, noise_map_of(camera), training, validation, *sizes), test
+    sizes = options.width, options.batch, options.out
+    return Setting(camera, *models, noise_map_of(camera), training, validation, *sizes, *digests), test
 
 
 def suffix_of(noise: str) -> str:
     """What the name of a network that was trained with this noise ends with."""
-    return "" if noise == "hsnoise" else f", {noise} noise"
+    return "" if noise == "hsnoise" else f", {Path(noise).stem} noise"
+
+
+def folders_of(setting: Setting, budget: Budget, options: argparse.Namespace) -> tuple[Path, Path]:
+    """Where scores are that may be compared: of networks that were trained alike, and of what needs no training."""
+    rates = "-".join(f"{rate:g}" for rate in options.rates)
+    tests = f"{options.crop}-{setting.digest}"
+    alike = f"{setting.width:g}-{setting.pieces}-{budget}-{rates}-{tests}"
+    return setting.out / f"trained-{alike}", setting.out / f"untrained-{tests}"
 
 
 def measures(
     setting: Setting, scenes: Sequence[Scene], options: argparse.Namespace
-) -> dict[str, Callable[[], dict[str, Any]]]:
-    """By name of a method, what trains or tunes it if need be and gives its scores; those in `--out` are read."""
+) -> tuple[tuple[Path, Path], list[Callable[[], None]]]:
+    """Folders of scores, and what trains or tunes each method if need be and writes its scores there."""
     budget = Budget(options.minutes if options.minutes or options.steps else MINUTES, options.steps)
-    noise = suffix_of(options.noise)
+    noise, folders = suffix_of(options.noise), folders_of(setting, budget, options)
 
     def of_network(name: str) -> dict[str, Any]:
         rate = best_rate(setting, name, budget, options.rates, options.crop)
         net, about = trained(setting, name, rate, budget)
-        return about | {"frames": tested(partial(_of_scene, net), scenes, options.out / f"{name}{noise}")}
+        return about | {"frames": tested(partial(_of_scene, net), scenes, folders[0] / f"{name}{noise}")}
 
     def of_untrained(name: str, denoise: Denoiser) -> dict[str, Any]:
         mean_e = middle_of(setting.camera.mean_e)
         tuning = scene_of(setting.validation[0], setting.camera, mean_e, options.crop, 99, TESTED_FRAMES)
-        return {"frames": tested(prepared(name, denoise, tuning), scenes, options.out / name)}
+        return {"frames": tested(prepared(name, denoise, tuning), scenes, folders[1] / name)}
 
-    rates = "-".join(f"{rate:g}" for rate in options.rates)
-    found = {
-        name + noise: partial(
-            kept, setting.out / f"{named(setting, name, budget)}-{rates}-{options.crop}.json", of_network, name
-        )
-        for name in options.networks
+    def of_input() -> dict[str, Any]:
+        return {
+            "frames": tested(lambda scene: np.asarray(display_from_linear(scene.noisy)), scenes, folders[1] / REFER)
+        }
+
+    digests = setting.noise_digest, setting.digest
+    found = [
+        partial(keep, folders[0] / f"{name}{noise}.json", digests[0], of_network, name) for name in options.networks
+    ]
+    if options.untrained:
+        found.append(partial(keep, folders[1] / f"{REFER}.json", digests[1], of_input))
+        for name, denoise in rivals().items():
+            found.append(partial(keep, folders[1] / f"{name}.json", digests[1], of_untrained, name, denoise))
+    return folders, found
+
+
+def keep(path: Path, digest: str, measure: Callable[..., dict[str, Any]], *what: Any) -> None:
+    """Measure and write a file, unless it is there with this digest."""
+    if not (path.exists() and json.loads(path.read_text())["digest"] == digest):
+        write_atomically(path, json.dumps({"digest": digest} | measure(*what), indent=1).encode())
+
+
+def write_results(folders: tuple[Path, Path], scenes: Sequence[Scene], ours: str, out: Path) -> list[Sheet]:
+    """The tables of all scores in these folders; tables, scores and pictures are written to `out`."""
+    of_methods = {path.stem: path for folder in folders for path in sorted(folder.glob("*.json"))}
+    results = {
+        name: json.loads(of_methods[name].read_text()) for name in sorted(of_methods, key=lambda name: name != ours)
     }
-    for name, denoise in rivals().items() if options.untrained else ():
-        path = setting.out / f"{name.replace(' ', '-')}-{setting.digest}-{options.crop}.json"
-        found[name] = partial(kept, path, of_untrained, name, denoise)
-    return found
-
-
-def kept(path: Path, measure: Callable[..., dict[str, Any]], *what: Any) -> dict[str, Any]:
-    """What stands in a file, or else what is measured, and then stands there."""
-    if not path.exists():
-        write_atomically(path, json.dumps(measure(*what), indent=1).encode())
-    return json.loads(path.read_text())
+    sheets = tables(results, ours)
+    write_atomically(out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
+    write_atomically(out / "networks.csv", csv_of(results).encode())
+    write_figure(out / "networks.png", draw_scores(results, ours, scenes[0].camera.in_words), dpi=110)
+    middle = sorted({scene.mean_e for scene in scenes})[LEVELS // 2]
+    pictures = {name: of_methods[name].with_suffix("") for name in results}
+    for scene in scenes:
+        if scene.mean_e == middle:
+            write_figure(out / f"{scene.clip}.png", draw_scene(scene, pictures), dpi=110)
+    return sheets
 
 
 def run(options: argparse.Namespace) -> None:
@@ -287,12 +324,10 @@ def run(options: argparse.Namespace) -> None:
         scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
         for number, (clip, level) in enumerate(tasks)
     ]
-    results: dict[str, dict] = {}
-    for name, measure in measures(setting, scenes, options).items():
-        results[name] = measure()
-        sheets = tables(results, OURS + suffix_of(options.noise))
-        write_atomically(options.out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
-        write_atomically(options.out / "networks.csv", csv_of(results).encode())
+    folders, found = measures(setting, scenes, options)
+    for measure in found:
+        measure()
+        sheets = write_results(folders, scenes, OURS + suffix_of(options.noise), options.out)
     for sheet in sheets:
         Console(width=150).print(sheet.rich())
 

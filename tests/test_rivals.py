@@ -263,25 +263,30 @@ def test_bad_options_are_named(tmp_path, capsys, more, words):
 
 @pytest.mark.slow
 def test_the_command_trains_scores_and_keeps_what_is_finished(tmp_path, capsys):
-    rng = np.random.default_rng(0)
+    rng, clips = np.random.default_rng(0), tmp_path / "clips"
+    clips.mkdir()
     for name in "abc":
         frames = np.kron(rng.integers(40, 200, (8, 16, 16, 3)), np.ones((1, 4, 4, 1))).astype(np.uint8)
-        np.savez(tmp_path / f"{name}.npz", frames=frames)
+        np.savez(clips / f"{name}.npz", frames=frames)
     (tmp_path / "split.toml").write_text('training = ["a"]\nvalidation = ["b"]\ntest = ["c"]\n')
     out = tmp_path / "out"
-    given = ["--clips", tmp_path, "--split", tmp_path / "split.toml", "--out", out, "--networks", "FFDNet"]
+    given = ["--clips", clips, "--split", tmp_path / "split.toml", "--out", out, "--networks", "FFDNet"]
     command = [*map(str, given), "--steps", "6", "--width", "0.125", "--crop", "64", "--rates", "1e-3", "3e-3"]
     main(command)
     first = capsys.readouterr().out
     assert "FFDNet: " in first and "6 steps" in first and "| FFDNet |" in (out / "networks.md").read_text()
-    found = json.loads(next(out.glob("*.json")).read_text())
+    scores = next(out.glob("trained-*/FFDNet.json"))
+    found = json.loads(scores.read_text())
     assert {record["clip"] for record in found["frames"]} == {"c"} and found["steps"] == 6 and found["parameters"] > 0
     assert (out / "networks.csv").read_text().count("FFDNet,c,") == len(found["frames"]) == 5 * 8
-    assert len(list((out / "FFDNet").glob("c-*e.png"))) == 5
-    next(out.glob("*.json")).unlink()  # the scores, as if interrupted before them
+    assert len(list(scores.with_suffix("").glob("c-*e.png"))) == 5
+    assert (out / "networks.png").stat().st_size > 10_000 and (out / "c.png").stat().st_size > 10_000
+    scores.unlink()  # as if interrupted before them
     main(command)
     again = capsys.readouterr().out
     assert "steps" not in again.split("Held-out")[0]
-    assert json.loads(next(out.glob("*.json")).read_text())["frames"] == found["frames"]
+    assert json.loads(scores.read_text())["frames"] == found["frames"]
     main([*command, "--noise", "gaussian"])
-    assert "FFDNet, gaussian noise" in (out / "networks.md").read_text()
+    table = (out / "networks.md").read_text()
+    assert "| FFDNet, gaussian noise |" in table and "| FFDNet |" in table  # those of earlier commands, too
+    assert len((out / "networks.csv").read_text().splitlines()) == 1 + 2 * 5 * 8
