@@ -45,6 +45,7 @@ from hsnoise.simulation.draws import check_fits, draw_capture
 from hsnoise.simulation.portion import Portion, usable_flats
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.apart import FEWEST_FRAMES, Apart
+from hsnoise.statistics.pixels.narrow import Narrow, is_narrow, narrow_from_posterior
 from hsnoise.statistics.structure import OF_FLATS
 
 NEEDED = ("gain", "read_noise")
@@ -209,6 +210,21 @@ def _apart(darks: FrameStack, model: NoiseModel) -> tuple[Apart, ...]:
     return tuple(found)
 
 
+def _narrow(darks: FrameStack, rng: np.random.Generator) -> Narrow | None:
+    """Levels and noise of pixels by the exposure with most frames, if their noise is below a count."""
+    frames = np.stack(list(darks.frames(int(np.argmax(darks.n_frames)))))
+    step = len(cfa_tile(darks.cfa))
+    planes = [(slice(p // step, None, step), slice(p % step, None, step)) for p in range(step * step)]
+    if not all(is_narrow(frames[:, *at]) for at in planes):
+        return None
+    level, sigma, slopes = np.empty(darks.shape), np.empty(darks.shape), []
+    for at in planes:
+        found = narrow_from_posterior(frames[:, *at], rng)
+        level[at], sigma[at] = found.level, found.sigma
+        slopes.append(found.slope)
+    return Narrow(level, sigma, float(np.mean(slopes)))
+
+
 @dataclass(frozen=True)
 class _Closing:
     """The frames that are measured, what they were taken apart into, and the key of all draws."""
@@ -221,7 +237,8 @@ class _Closing:
     def of(darks: FrameStack, model: NoiseModel, seed: int) -> _Closing:
         key = key_for(seed, Purpose.CLOSE)
         words = np.asarray(jax.random.bits(named_key(key, "maps"), (4,), np.uint32))
-        return _Closing(darks, Sensor(_apart(darks, model), np.random.default_rng(words), darks.window), key)
+        rng = np.random.default_rng(words)
+        return _Closing(darks, Sensor(_apart(darks, model), rng, darks.window, _narrow(darks, rng)), key)
 
     def starts(self, model: NoiseModel) -> list[NoiseModel]:
         """The model with maps in place of patterns; and without effects that overshoot, where there are any.
@@ -240,6 +257,8 @@ class _Closing:
             drawn = self.drawn(model, number)
             before, model = mean_power(model), with_spectra(model, self.sensor.seen, drawn)
             model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
+            if self.sensor.narrow is not None:  # how often pixels hold each count has told the rest
+                continue
             model = with_spread(with_shot_noise(model, self.sensor, drawn), self.sensor, drawn)
             if number == 0:
                 model = with_distribution(model, self.sensor)

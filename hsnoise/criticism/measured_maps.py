@@ -14,6 +14,7 @@ from hsnoise.effects import MeasuredMap
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
 from hsnoise.statistics.apart import CORE_SIGMAS, ORDINARY, Apart, core_sigma
+from hsnoise.statistics.pixels.narrow import Narrow
 from hsnoise.statistics.pixels.shrinking import NEAR, surroundings, values_from_posterior, variances_from_posterior
 from hsnoise.statistics.spectra import periodogram, series_from_posterior
 
@@ -30,12 +31,13 @@ LOWEST = 0.02  # share of the pixels with the least dark current, which counts a
 class Sensor:
     """Dark exposures of one sensor taken apart, and the random numbers of its posterior.
 
-    window: as in FrameStack.
+    window: as in FrameStack; narrow: levels and noise of the pixels, where their noise is below a count.
     """
 
     seen: Sequence[Apart]
     rng: np.random.Generator
     window: Window | None
+    narrow: Narrow | None = None
 
     @property
     def exposure_s(self) -> np.ndarray:
@@ -61,6 +63,20 @@ class Sensor:
 
     def with_map(self, model: NoiseModel) -> NoiseModel:
         """The model with the maps of this sensor; the rate of the dark current is their mean."""
+        return self._with_averages(model) if self.narrow is None else self._with_narrow(model, self.narrow)
+
+    def _with_narrow(self, model: NoiseModel, narrow: Narrow) -> NoiseModel:
+        """The same where counts do not average to levels: offset and noise; the dark current of the fit stays."""
+        one, channel = max(self.seen, key=lambda one: one.n_frames), channel_index(model.cfa, narrow.level.shape)
+        gain = np.asarray(model["gain"].value)[channel]
+        dark = gain * float(model["dark_current"].rate) * one.exposure_s if "dark_current" in model else 0.0
+        shared = sum(float(np.mean(of**2)) for of in (one.frame, one.row, one.column)) / (one.freedom * narrow.slope**2)
+        read = np.sqrt(np.maximum(narrow.sigma**2 - shared, LEAST_READ_DN2)) / gain
+        model = model.with_value("read_noise", "sigma", np.sqrt(np.mean(read**2)))
+        maps = {"offset": narrow.level - dark - black_level_of(model)[channel], "read_noise": of_mean_square_one(read)}
+        return self._added(model, maps)
+
+    def _with_averages(self, model: NoiseModel) -> NoiseModel:
         step, shape = len(cfa_tile(model.cfa)), self.seen[0].mean.shape
         channel = channel_index(model.cfa, shape)
         gain = np.asarray(model["gain"].value)[channel]
@@ -81,6 +97,9 @@ class Sensor:
             maps |= {"growth": growth - charge} if np.any(growth != charge) else {}
             if rate.any():
                 maps |= {"dark_current": rate / rate.mean(), "dark_fluctuation": fluctuation}
+        return self._added(model, maps)
+
+    def _added(self, model: NoiseModel, maps: dict[str, np.ndarray]) -> NoiseModel:
         first = (0, 0) if self.window is None else self.window[:2]
         return model.add(MeasuredMap(**{name: x.astype(np.float32) for name, x in maps.items()}, first=first))
 

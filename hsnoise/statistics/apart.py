@@ -16,6 +16,7 @@ HIT_SIGMAS = 8.0  # deviation of one frame from all others of a pixel that is a 
 FEWEST_FRAMES = 4  # of which one can be told to be a hit
 ORDINARY = 0.999  # of the pixels
 NORMAL_QUANTILE = 1.4826
+ROUNDING_DN = 1 / 12**0.5  # standard deviation of rounding: counts apart by one are no outliers
 MOST_OF_SPREAD = 200_000  # values from which a width is taken
 
 
@@ -54,11 +55,11 @@ class Apart:
         x = frames.astype(np.float32)
         mean = x.mean(0)
         rest = x - mean
-        at, level = _hits(x, core_sigma(rest))
+        at, level = _hits(x, max(core_sigma(rest), ROUNDING_DN))
         rest[:, *at[1:]], mean[at[1:]] = x[:, *at[1:]] - level, level
         is_hit, hits = np.zeros(mean.shape, bool), rest[at]
         is_hit[at[1:]], rest[at] = True, 0
-        width = CORE_SIGMAS * core_sigma(rest)
+        width = CORE_SIGMAS * max(core_sigma(rest), ROUNDING_DN)
         clean = np.clip(rest, -width, width)
         frame = clean.mean((1, 2), dtype=np.float64)
         row = clean.mean(2, dtype=np.float64) - frame[:, None]
@@ -95,7 +96,7 @@ class Apart:
 
         "gain" is the variance over rows of the logarithm of their noise power: rows whose gain differs.
         """
-        width = CORE_SIGMAS * core_sigma(self.rest)
+        width = CORE_SIGMAS * max(core_sigma(self.rest), ROUNDING_DN)
         pixels = np.clip(self.rest, -width, width).reshape(-1, self.rest.shape[2])
         usual = USUAL_FRAME * core_sigma(self.frame)
         found = {"row": periodogram(self.row), "column": periodogram(self.column), "pixel": periodogram(pixels)}

@@ -44,7 +44,7 @@ def narrow_read_noise(counts) -> tuple[float, float]:
     return estimate, float(np.fmax(_bound(codes, share, within), estimate))
 
 
-def _law(codes: np.ndarray, levels_dn: np.ndarray, sigma_dn: float) -> np.ndarray:
+def law_of_counts(codes: np.ndarray, levels_dn: np.ndarray, sigma_dn: float) -> np.ndarray:
     """Probability of each count at each level [code, level]."""
     upper = scipy.special.ndtr((codes[:, None] + 0.5 - levels_dn) / sigma_dn)
     return np.diff(upper, axis=0, prepend=0.0)
@@ -64,7 +64,7 @@ def _bound(codes: np.ndarray, share: np.ndarray, variance: float) -> float:
 
 
 def _misfit(codes: np.ndarray, levels: np.ndarray, sigma: float, share: np.ndarray, variance: float) -> float:
-    law = _law(codes, levels, sigma)
+    law = law_of_counts(codes, levels, sigma)
     _, variances = _moments(codes, law)
     design = np.concatenate([law, variances[None], np.ones((1, len(levels)))])
     return float(scipy.optimize.nnls(design, np.concatenate([share, [variance, 1.0]]))[1])
@@ -78,7 +78,7 @@ def _estimate(codes: np.ndarray, share: np.ndarray, variance: float) -> float:
 
     def off(x):
         levels, sigma = x[0] + np.exp(x[1]) * z, np.exp(x[2])
-        means, variances = _moments(codes, _law(codes, levels, sigma))
+        means, variances = _moments(codes, law_of_counts(codes, levels, sigma))
         middle = weight @ means
         return [
             middle - mean,
