@@ -256,9 +256,9 @@ class _Closing:
         for number in range(ROUNDS):
             drawn = self.drawn(model, number)
             before, model = mean_power(model), with_spectra(model, self.sensor.seen, drawn)
-            model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
             if self.sensor.narrow is not None:  # how often pixels hold each count has told the rest
                 continue
+            model = with_read_noise(model, self.sensor, drawn, mean_power(model) - before)
             model = with_spread(with_shot_noise(model, self.sensor, drawn), self.sensor, drawn)
             if number == 0:
                 model = with_distribution(model, self.sensor)
