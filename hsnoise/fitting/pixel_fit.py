@@ -19,6 +19,7 @@ from hsnoise.fitting.pixel_flats import Responses, photo_response
 from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
+from hsnoise.fitting.pixel_narrow import law_of, narrow_of, variance_of, with_law
 from hsnoise.fitting.pixel_offsets import offset_of, pattern_of
 from hsnoise.fitting.pixel_outputs import outputs_by_light
 from hsnoise.fitting.pixel_patterns import (
@@ -77,7 +78,7 @@ class Channel:
             error, and its chance deviation if there is none.
         lines: by axis, static levels of rows and columns beside that drift.
         temporal_dn2: variance of the pixels themselves.
-        is_narrow: whether that noise is narrower than a count: rounding hides differences of pixels then.
+        is_narrow: whether that noise is narrower than a count, and rounding hides how pixels differ.
         shading: by axis, a drift of the static means of columns or rows; its variance is not in `patterns`.
         row_spectrum, column_spectrum: of what rows and columns share in a frame.
         noise_spread: of the logarithm of read noise over pixels, rows and columns.
@@ -160,6 +161,7 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     register = multiplied_of(found, told)
     wander_dn2 = 0.0 if taps is None else taps.changes_dn2().get("temporal", 0.0)
     channels = [_channel(found, c, name, register, told, wander_dn2) for c, name in enumerate(found.channels)]
+    channels = [with_law(one, law_of(found, c), narrow_of(found, c)) for c, one in enumerate(channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
     taps, channels, parity_told = outputs_by_light(found, taps, channels)
@@ -182,12 +184,12 @@ def _channel(
 ) -> Channel:
     """wander_dn2: variance of pixels over time that outputs make whose change is neither of rows nor of columns."""
     (growth, growth_error), black = growth_of_means(found, c)
-    narrow = _narrow(found, c)
+    narrow = narrow_of(found, c)
     is_plain = narrow is None and register is None  # else rounding or multiplied electrons shape the noise
     jumps, jumping = jumps_of(found, c) if is_plain else (None, None)
     tail = tail_of(found, c) if is_plain and jumps is None else None
     raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
-    floor, floor_error = _temporal(found, c, raised) if narrow is None else _of_narrow(narrow)
+    floor, floor_error = _temporal(found, c, raised) if narrow is None else variance_of(narrow)
     pixels = levels_of(found, c, without=jumping) if is_plain else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     of_columns = column_spectrum(shortest_of(found, c), found.shape[1], known_of_columns(found, c))
@@ -329,11 +331,6 @@ def _warm(found: Survey, c: int) -> Warm | None:
     return warm_of(found.shortest.pixels(c, "level_dn"), len(shortest_of(found, c)[0].column_mean_dn))
 
 
-def _narrow(found: Survey, c: int) -> tuple[float, float] | None:
-    """Estimate and bound of the noise of the shortest exposure, DN, if it is narrower than a count."""
-    return next((p.narrow_dn for p in shortest_of(found, c)), None)
-
-
 def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:
     """The gain of the flats. Rounding changes the variance of darks that are narrower than a count.
 
@@ -341,20 +338,13 @@ def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:
     """
     if (flats := summary.flats) is None:
         return None
-    narrow = [of for c in range(len(found.channels)) if (of := _narrow(found, c)) is not None]
+    narrow = [of for c in range(len(found.channels)) if (of := narrow_of(found, c)) is not None]
     if len(narrow) == len(found.channels):
-        variance, error = np.array([_of_narrow(of) for of in narrow]).T
+        variance, error = np.array([variance_of(of) for of in narrow]).T
         by_noise = flat_gain(flats, None, variance, error)
         if by_noise.described.all():
             return by_noise
     return flat_gain(flats)
-
-
-def _of_narrow(narrow: tuple[float, float]) -> tuple[float, float]:
-    """Variance of narrow noise, rounding included, and its error: the bound is two errors away."""
-    estimate, bound = narrow
-    middle = estimate if np.isfinite(estimate) else bound / 2
-    return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
 def _temporal(found: Survey, c: int, raised: float) -> tuple[float, float]:

@@ -8,6 +8,7 @@ noise. All pixels together tell how levels and noise are distributed; what one o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,16 @@ NARROW_DN = 0.4  # of noise, below which counts do not average to levels
 STEP_DN = 0.04  # of the grid of levels, and of what lines add to them
 SIGMAS = 12  # of the grid of noise
 ITERATIONS = 100  # of the distribution; few, so that it stays smooth
-SPREAD = 0.3  # of the logarithms of the pixels' noise, before anything is learnt
+SPREAD, WIDER = 0.3, 1e-3  # of the logarithms of the pixels' noise, and share of any level, before anything is learnt
 LEARNT_FROM = 200_000  # pixels
 AT_ONCE = 2000  # patterns
 FAR = 1e-4  # quantile of the counts beyond which a pixel is not like the others
 UNLIKELY = 1e-6  # probability of a count, at least: tails are longer than normal ones
 LINES = 2  # times that what rows and columns add is measured
+PARTS = 4  # of the rows, by whose scatter errors are told
+COARSE = 0.01  # relative error beside chance: noise is not quite normal, and the grid is coarse
+USUAL_DN = 0.25  # of noise, for which that is so
+FEW_FRAMES, OF_NOISE = 0.3, 0.08  # the same for a single frame; less of it for the noise
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,44 @@ class Narrow:
     slope: float
 
 
+class NarrowLaw(NamedTuple):
+    """How pixels whose noise is below a count are distributed: each a value and its standard error, DN.
+
+    sigma: noise over time, rms, what frames, rows and columns share included. spread: of the logarithms of the pixels'
+    noise. offset: standard deviation of levels beside those of rows and columns. raised: mean of the counts less that
+    of the levels. slope: by how much the mean of the counts moves with the levels.
+    """
+
+    sigma: tuple[float, float]
+    spread: tuple[float, float]
+    offset: tuple[float, float]
+    raised: tuple[float, float]
+    slope: tuple[float, float]
+
+
+def narrow_law(counts: np.ndarray) -> NarrowLaw:
+    """How the pixels of darks of one exposure and colour [frame, row, column] are distributed."""
+    found = np.array([_law_of(part) for part in np.array_split(counts, min(PARTS, counts.shape[1]), axis=1)])
+    mean, error = found.mean(0), found.std(0, ddof=1) / np.sqrt(len(found))
+    few = np.full(len(mean), FEW_FRAMES)
+    few[0] = OF_NOISE
+    coarse = COARSE * max(1.0, USUAL_DN / float(mean[0])) ** 3  # the narrower, the coarser what counts tell
+    error = np.hypot(error, (coarse + few / len(counts)) * np.abs(mean))
+    law = NarrowLaw(*zip(mean.tolist(), error.tolist(), strict=True))
+    # What few frames do not tell of it stays as it was assumed.
+    return law._replace(spread=(law.spread[0], float(np.hypot(law.spread[1], SPREAD / np.sqrt(len(counts))))))
+
+
+def _law_of(counts: np.ndarray) -> tuple[float, ...]:
+    learnt = _learnt(counts, np.random.default_rng(0))
+    level, sigma, share = learnt.grid.level, learnt.grid.sigma, learnt.share
+    middle, log = share @ level, np.log(sigma)
+    raised = learnt.mean.mean() - middle - STEP_DN * float(learnt.shift.mean())
+    offset = share @ (level - middle) ** 2 - STEP_DN**2 / 12  # of the steps of what lines add
+    rms, spread = share @ sigma**2, share @ (log - share @ log) ** 2
+    return (*(float(np.sqrt(max(of, 0.0))) for of in (rms, spread, offset)), float(raised), learnt.slope)
+
+
 def is_narrow(counts: np.ndarray) -> bool:
     """Whether the noise of darks [frame, row, column] is below a count."""
     estimate, _ = narrow_read_noise(counts)
@@ -45,24 +88,48 @@ def is_narrow(counts: np.ndarray) -> bool:
 
 def narrow_from_posterior(counts: np.ndarray, rng: np.random.Generator) -> Narrow:
     """Levels and noise of the pixels of darks of one exposure and colour [frame, row, column]."""
-    shape, mean = counts.shape[1:], counts.mean(0, dtype=np.float64)
-    low, high = np.quantile(mean, (FAR, 1 - FAR))
-    codes = np.arange(np.floor(low) - 1, np.ceil(high) + 2)
-    held = _histograms(counts, codes)
-    grid = _Grid.of(codes, low, high)
-    usual, _ = narrow_read_noise(counts)
-    lines, slope = np.zeros(shape), 1.0
-    for _ in range(LINES):  # rows and columns shift the levels of a thousand pixels: they are known far better
-        off = mean - mean.mean()
-        lines = (off.mean(1, keepdims=True) + off.mean(0, keepdims=True)) / slope
-        shift = np.rint(lines / STEP_DN).astype(int).ravel()
-        share = grid.learnt(usual, *_sample(held, shift, rng))
-        slope = grid.slope(share)
-    level, sigma = grid.drawn(share, held, shift, rng)
-    level = level.reshape(shape) + lines - STEP_DN * shift.reshape(shape)
+    learnt, shape = _learnt(counts, rng), counts.shape[1:]
+    level, sigma = learnt.grid.drawn(learnt.share, learnt.held, learnt.shift, rng)
+    level = level.reshape(shape) + learnt.lines - STEP_DN * learnt.shift.reshape(shape)
+    codes, mean = learnt.grid.codes, learnt.mean
     far = (mean < codes[0] + 1) | (mean > codes[-1] - 1)
     own = np.sqrt(np.maximum(counts.var(0, ddof=1), STEP_DN**2))
-    return Narrow(np.where(far, mean, level), np.where(far, own, sigma.reshape(shape)), slope)
+    return Narrow(np.where(far, mean, level), np.where(far, own, sigma.reshape(shape)), learnt.slope)
+
+
+@dataclass(frozen=True)
+class _Learnt:
+    """What all pixels together tell.
+
+    mean: of the counts of each pixel [row, column]; held: how often each holds each count [pixel, code]; lines: what
+    rows and columns add to levels [row, column], DN, and shift: the same in steps [pixel]; share: of the pixels at each
+    place of the grid.
+    """
+
+    grid: _Grid
+    mean: np.ndarray
+    held: np.ndarray
+    lines: np.ndarray
+    shift: np.ndarray
+    share: np.ndarray
+    slope: float
+
+
+def _learnt(counts: np.ndarray, rng: np.random.Generator) -> _Learnt:
+    mean = counts.mean(0, dtype=np.float64)
+    low, high = np.quantile(mean, (FAR, 1 - FAR))
+    codes = np.arange(np.floor(low) - 1, np.ceil(high) + 2)
+    held, grid = _histograms(counts, codes), _Grid.of(codes, low, high)
+    usual, _ = narrow_read_noise(counts)
+    usual = usual if np.isfinite(usual) else NARROW_DN
+    slope, off = 1.0, np.clip(mean, low, high)
+    off = off - off.mean()
+    for _ in range(LINES):  # rows and columns shift the levels of a thousand pixels: they are known far better
+        lines = (off.mean(1, keepdims=True) + off.mean(0, keepdims=True)) / slope
+        shift = np.rint(lines / STEP_DN).astype(int).ravel()
+        share = grid.learnt(grid.first(off - slope * lines, mean.mean(), usual), *_sample(held, shift, rng))
+        slope = grid.slope(share, shift)
+    return _Learnt(grid, mean, held, lines, shift, share, slope)
 
 
 def _histograms(counts: np.ndarray, codes: np.ndarray) -> np.ndarray:
@@ -111,21 +178,29 @@ class _Grid:
             found[of] = held[of] @ np.log(law + UNLIKELY)
         return np.exp(found - found.max(1, keepdims=True))
 
-    def learnt(self, usual: float, held: np.ndarray, shift: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The share of the pixels at each place: from their usual noise, patterns, and how many pixels have each."""
+    def first(self, beside: np.ndarray, level: float, usual: float) -> np.ndarray:
+        """What is assumed before anything is learnt: normal levels as wide as the means of counts, and usual noise."""
+        wide = np.exp(-0.5 * ((self.level - level) / max(float(beside.std()), STEP_DN)) ** 2)
+        return (wide + WIDER) * np.exp(-0.5 * (np.log(self.sigma / usual) / SPREAD) ** 2)
+
+    def learnt(self, share: np.ndarray, held: np.ndarray, shift: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """The share of the pixels at each place: from what is assumed, patterns, and how many pixels have each."""
         likelihood = self.likelihood(held, shift)
-        share = np.exp(-0.5 * (np.log(self.sigma / usual) / SPREAD) ** 2)
         for _ in range(ITERATIONS):
             share = share * (likelihood.T @ (times / (likelihood @ share))) / times.sum()
         return share
 
-    def slope(self, share: np.ndarray) -> float:
+    def slope(self, share: np.ndarray, shift: np.ndarray) -> float:
         """How much the mean of the counts of all pixels moves with their levels."""
+        moved, times = np.unique(shift, return_counts=True)
         low, high = (
-            self.codes @ law_of_counts(self.codes, self.level + step, self.sigma) @ share
-            for step in (-STEP_DN / 2, STEP_DN / 2)
+            sum(
+                n * (self.codes @ law_of_counts(self.codes, self.level + STEP_DN * at, self.sigma) @ share)
+                for at, n in of
+            )
+            for of in (list(zip(moved + half, times, strict=True)) for half in (-0.5, 0.5))
         )
-        return float(high - low) / STEP_DN
+        return float(high - low) / (STEP_DN * times.sum())
 
     def drawn(self, share: np.ndarray, held: np.ndarray, shift: np.ndarray, rng: np.random.Generator):
         """Level and noise of each pixel, drawn from what its pattern allows."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_of
 from hsnoise.statistics.pixels.look import Look, OddLines
+from hsnoise.statistics.pixels.narrow import NARROW_DN, NarrowLaw, narrow_law
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
@@ -44,6 +45,7 @@ class Plane:
         the frames, DN; of the shortest repeated darks alone.
     neighbours_share: correlation of the temporal noise of neighbours in a row; NaN with one frame.
     narrow_dn: estimate and upper bound of noise narrower than a count, DN; None for wider noise.
+    narrow_law: how such pixels are distributed; looked for in the darks of most frames alone.
     """
 
     channel: int
@@ -60,6 +62,7 @@ class Plane:
     blocks_dn: np.ndarray | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
+    narrow_law: NarrowLaw | None = None
 
 
 @dataclass(frozen=True)
@@ -206,9 +209,9 @@ def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Surv
     cell = len(cfa_tile(stack.cfa))
     rows = sampled_rows(stack.shape, cell, stack.n_exposures, max(stack.n_frames))
     highest = 0
-    groups, steps, shortest = [], [], shortest_repeated(stack)
+    groups, steps, looked_at = [], [], (shortest_repeated(stack), _of_most_frames(stack))
     for i in range(stack.n_exposures):
-        group, top, step = _group(stack, i, rows, tick, looks_for_row_groups=i == shortest)
+        group, top, step = _group(stack, i, rows, tick, *(i == of for of in looked_at))
         groups.append(group)
         steps.append(step)
         highest = max(highest, top)
@@ -227,7 +230,12 @@ def _full_scale(highest: int) -> float:
 
 
 def _group(
-    stack: FrameStack, i: int, rows: np.ndarray, tick: Callable[[], object], *, looks_for_row_groups: bool
+    stack: FrameStack,
+    i: int,
+    rows: np.ndarray,
+    tick: Callable[[], object],
+    looks_for_row_groups: bool,
+    looks_at_counts: bool,
 ) -> tuple[Group, int, int]:
     """A group, its highest count, and the largest number of which the counts of its first frame are multiples."""
     tile, n = cfa_tile(stack.cfa), stack.n_frames[i]
@@ -244,6 +252,11 @@ def _group(
         _plane(seen.sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
         for p in range(step**2)
     )
+    if looks_at_counts:
+        planes = tuple(
+            replace(one, narrow_law=_law(one, kept[:, p // step :: step, p % step :: step]))
+            for p, one in enumerate(planes)
+        )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
     banding, means = planes[0].banding.get("row"), seen.row_means
@@ -336,6 +349,16 @@ def _neighbours_share(counts: np.ndarray) -> float:
     change = np.clip(change, -width, width)
     variance = float(np.mean(change**2, dtype=np.float64))
     return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0
+
+
+def _of_most_frames(stack: FrameStack) -> int | None:
+    """The repeated darks of most frames, the shortest of several."""
+    darks = [i for i, kind in enumerate(stack.kind) if kind == "dark" and stack.n_frames[i] > 1]
+    return min(darks, key=lambda i: (-stack.n_frames[i], stack.exposure_s[i]), default=None)
+
+
+def _law(plane: Plane, counts: np.ndarray) -> NarrowLaw | None:
+    return narrow_law(counts) if plane.narrow_dn is not None and plane.narrow_dn[0] < NARROW_DN else None
 
 
 def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
