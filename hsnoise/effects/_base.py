@@ -104,6 +104,10 @@ class Capture(eqx.Module):
         """Numbers of the frames' columns on the sensor."""
         return self._lines(1)
 
+    def alternating(self, axis: int) -> np.ndarray | jax.Array:
+        """-1/2 on even and 1/2 on odd rows (axis 0) or columns (1) of the sensor; in a Bayer sensor pairs of them."""
+        return self._lines(axis) // (1 if self.cfa == "mono" else 2) % 2 - 0.5
+
     def _lines(self, axis: int) -> np.ndarray | jax.Array:
         lines = np.arange(self.shape[axis]) + (0 if self.window is None else self.window[axis])
         return lines if self.moved is None else lines + self.moved[axis]

@@ -46,14 +46,13 @@ class PhotoResponseNonuniformity(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         _, rows, columns = signal.shape
-        width = 1 if capture.cfa == "mono" else 2
         pattern = 1 + self.sigma * jax.random.normal(capture.fixed_key(self.name), (1, rows, columns), signal.dtype)
-        for part, sigma, parity, lines, shape in (
-            (".rows", self.row_sigma, self.row_parity, capture.rows, (1, rows, 1)),
-            (".columns", self.column_sigma, self.column_parity, capture.columns, (1, 1, columns)),
+        for axis, part, sigma, parity, shape in (
+            (0, ".rows", self.row_sigma, self.row_parity, (1, rows, 1)),
+            (1, ".columns", self.column_sigma, self.column_parity, (1, 1, columns)),
         ):
             z = jax.random.normal(capture.fixed_key(self.name + part), shape, signal.dtype)
-            odd = jnp.asarray(lines // width % 2 - 0.5, signal.dtype).reshape(shape)
+            odd = jnp.asarray(capture.alternating(axis), signal.dtype).reshape(shape)
             pattern = pattern + sigma * z + parity * odd
         return signal * jnp.maximum(pattern, 0)
 

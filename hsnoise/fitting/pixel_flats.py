@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -224,3 +225,10 @@ def weighted_mean(pairs: list[tuple[float, float]]) -> tuple[float, float]:
     values, errors = np.array(pairs, float).T
     weight = errors**-2
     return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def bends_of(bends: Sequence[Bend]) -> dict[str, dict[str, tuple[float, float]]]:
+    """What bends the photon transfer curve, if it does in all colours; that it does is known from the curve itself."""
+    curvature, spread = (of_colours(list(of)) for of in zip(*(one[:2] for one in bends), strict=True))
+    found = {"nonlinearity": {"curvature": curvature}} if np.isfinite(curvature[1]) else {}
+    return found | ({"brighter_fatter": {"strength": spread}} if np.isfinite(spread[1]) else {})

@@ -12,8 +12,10 @@ from hsnoise.fitting.pixel_rows import LEAST_ERROR, widened
 from hsnoise.statistics.pixels.shading import FAR, Shading
 from hsnoise.statistics.pixels.survey import Plane
 
+FEWEST_LINES = 32  # for a difference of even and odd ones
 FEW = 0.05  # share of lines with a defect; of more, levels have two or three values, as bands leave them
 EFFICIENCY = 2 / 3  # of differences of neighbours, which overlap
+PARITY_THERE = 4.0  # errors of a difference of even and odd lines
 ALIKE, BEYOND_CHANCE = 0.5, 5.0  # share of the variance, and its errors, that neighbours have in common
 
 
@@ -28,6 +30,8 @@ class Lines(NamedTuple):
         exponent: of the spectrum over the lines, by how neighbours resemble each other; 0 and an infinite error if they
             do not, or more than any exponent makes them.
         far, farthest_dn: how many lie far off, and by how much at most, DN.
+        parity_dn: odd lines of the sensor less even ones, and its error, if mono frames show it beyond chance; it is in
+            none of the above.
     """
 
     variance_dn2: float
@@ -37,14 +41,20 @@ class Lines(NamedTuple):
     exponent: tuple[float, float]
     far: int
     farthest_dn: float
+    parity_dn: tuple[float, float] | None = None
 
 
-def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading], frames: int, step: int) -> Lines:
+def lines_of(
+    planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading], frames: int, step: int, first: int = 0
+) -> Lines:
     """The static lines of an axis ("row" or "column") in the planes of one channel, means over so many frames.
 
-    step: lines of the sensor from one of a plane to the next.
+    step: lines of the sensor from one of a plane to the next; first: number of the first one on the sensor.
     """
     rest = [_rest(getattr(plane, f"{axis}_mean_dn"), shading.get(axis)) for plane in planes]
+    parity = _parity(rest[0], first) if step == 1 else None
+    if parity is not None:
+        rest = [rest[0] - parity[0] * _odd(rest[0], first)]
     near = [_near(of) for of in rest]
     noise = float(np.mean([_noise_dn2(plane, axis, frames) for plane in planes]))
     variance = float(np.mean([of[there].var(ddof=1) for of, there in zip(rest, near, strict=True)]))
@@ -60,7 +70,26 @@ def lines_of(planes: Sequence[Plane], axis: str, shading: Mapping[str, Shading],
         error *= widened(np.array(fading_power(step * len(rest[0]), np.float32(exponent[0])), float))
     far = [np.abs(of[~there]) for of, there in zip(rest, near, strict=True)]
     farthest = max((float(of.max()) for of in far if len(of)), default=0.0)
-    return Lines(variance - noise, float(error), beside - noise, bool(follow), exponent, sum(map(len, far)), farthest)
+    several = sum(map(len, far)), farthest
+    return Lines(variance - noise, float(error), beside - noise, bool(follow), exponent, *several, parity)
+
+
+def _odd(rest_dn: np.ndarray, first: int) -> np.ndarray:
+    return (np.arange(len(rest_dn)) + first) % 2 - 0.5
+
+
+def _parity(rest_dn: np.ndarray, first: int) -> tuple[float, float] | None:
+    """Odd lines less even ones and its error, DN, if it is beyond chance and in both halves of the lines."""
+    if len(rest_dn) < FEWEST_LINES:
+        return None
+    excess = rest_dn[1:-1] - (rest_dn[:-2] + rest_dn[2:]) / 2
+    contrast = excess * np.sign(_odd(rest_dn, first)[1:-1])
+    middle, sigma = float(np.median(contrast)), _typical_dn(contrast)
+    value = float(np.clip(contrast, middle - FAR * sigma, middle + FAR * sigma).mean())
+    error = 2 * sigma / np.sqrt(1.5 * len(contrast))  # a value of independent lines has 1.5 times their variance
+    halves = [float(np.median(of)) for of in np.array_split(contrast, 2)]
+    there = abs(value) > PARITY_THERE * error and min(np.sign(value) * of for of in halves) > abs(value) / 2
+    return (value, error) if there else None
 
 
 def _exponent(correlation: float, error: float, lines: int, step: int) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import shortest_of
 from hsnoise.statistics.pixels.narrow import NarrowLaw
 from hsnoise.statistics.pixels.read_noise import NoiseSpread
@@ -25,6 +26,7 @@ class Channel(Protocol):
     covariance: np.ndarray
     black_dn: tuple[float, float]
     patterns: Mapping[str, tuple[float, float, float]]
+    lines: Mapping[str, Lines]
 
 
 C = TypeVar("C", bound=Channel)
@@ -72,6 +74,7 @@ def with_law(one: C, law: NarrowLaw | None, narrow: tuple[float, float] | None) 
         "covariance": covariance,
         "temporal_dn2": alone + ROUNDING,
         "patterns": patterns,
+        "lines": {axis: _parity_in_levels(of, slope, of_slope) for axis, of in one.lines.items()},
         "offset_dn": law.offset,
         "black_dn": (one.black_dn[0] - law.raised[0], float(np.hypot(one.black_dn[1], law.raised[1]))),
         "noise_spread": NoiseSpread(law.spread),
@@ -84,3 +87,10 @@ def _in_levels(of: tuple[float, float, float], slope: float, of_slope: float) ->
     """Variance, error and chance of levels, DN^2, from those of the means of counts."""
     variance, error, chance = (float(each) / slope**2 for each in of)
     return variance, float(np.hypot(error, 2 * variance * of_slope / slope)), chance
+
+
+def _parity_in_levels(lines: Lines, slope: float, of_slope: float) -> Lines:
+    if lines.parity_dn is None:
+        return lines
+    value, error = (each / slope for each in lines.parity_dn)
+    return lines._replace(parity_dn=(value, float(np.hypot(error, value * of_slope / slope))))

@@ -88,7 +88,9 @@ def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str,
     """Static rows and columns of a channel at the shortest dark exposure, by axis; empty without one."""
     planes = shortest_of(found, c)
     step = 1 if found.cfa == "mono" else 2
-    return {axis: lines_of(planes, axis, shading, found.shortest.n_frames, step) for axis in AXES} if planes else {}
+    frames = found.shortest.n_frames if planes else 0
+    each = zip(AXES, found.origin, strict=True)
+    return {axis: lines_of(planes, axis, shading, frames, step, first) for axis, first in each} if planes else {}
 
 
 def patterns_of(
@@ -110,8 +112,8 @@ def patterns_of(
         scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
-        if component in lines and (component in shading or lines[component].far):
-            of = lines[component]
+        of = lines.get(component)
+        if of is not None and (component in shading or of.far or of.parity_dn is not None):
             shared = replace(shared, variance_dn2=of.variance_dn2, standard_error_dn2=of.error_dn2)
         if component == "frame" and (course := found.settling) is not None:
             shared = _about(course, shared, planes)

@@ -43,12 +43,12 @@ from hsnoise.effects import (
 )
 from hsnoise.fitting.pixel_defects import hot_of, jumps_of, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
-from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, of_colours
+from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, bends_of, of_colours
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
-from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, offsets_of, shared_patterns
+from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, offsets_of, shared_patterns, with_parity
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -206,12 +206,13 @@ def _population(
         of_lines = [c.lines[axis].exponent for c in pixel.channels if axis in c.lines]
         if PATTERNS[axis] in found and all(value != 0 for value, _ in of_lines):
             found[PATTERNS[axis]]["exponent"] = of_colours(of_lines)
+    found = with_parity(found, pixel.channels, gain)
     found |= {**_noise_spread(pixel), **rays_of(pixel, gain), **jumps_of(pixel, gain), **of_glow(pixel.channels, gain)}
     if (register := pixel.channels[0].register) is not None:
         found |= effects_of(register)
     if pixel.ringing is not None:
         found["correlated_read_noise"] = pixel.ringing._asdict()
-    found |= _bends(pixel)
+    found |= bends_of([c.bend for c in pixel.channels])
     found |= _responses(pixel)
     many = [(c.population, g) for c, g in zip(pixel.channels, gain, strict=True) if c.population is not None]
     if not many:
@@ -232,13 +233,6 @@ def _responses(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
     lines = {name: of for name, of in found.items() if abs(of[0]) > max(THERE * of[1], LEAST_OF_LINES)}
     is_there = lines or sigma[0] > max(THERE * sigma[1], LEAST_RESPONSE)
     return {"photo_response_nonuniformity": {"sigma": sigma, **lines}} if is_there else {}
-
-
-def _bends(pixel: PixelFit) -> dict[str, dict[str, tuple[float, float]]]:
-    """What bends the photon transfer curve, if it does in all colours; that it does is known from the curve itself."""
-    curvature, spread = (of_colours(list(of)) for of in zip(*(c.bend[:2] for c in pixel.channels), strict=True))
-    found = {"nonlinearity": {"curvature": curvature}} if np.isfinite(curvature[1]) else {}
-    return found | ({"brighter_fatter": {"strength": spread}} if np.isfinite(spread[1]) else {})
 
 
 def _waves_and_groups(pixel: PixelFit, gain: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hsnoise._core.types import cfa_tile
+from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.statistics.pixels.glow import Glow
 from hsnoise.statistics.pixels.settling import Settling
@@ -24,6 +25,7 @@ class Channel(Protocol):
     whether it is narrower than a count; standard deviation of the pixels' offsets, DN, and its error."""
 
     patterns: Mapping[str, tuple[float, float, float]]
+    lines: Mapping[str, Lines]
     temporal_dn2: float
     is_narrow: bool
     offset_dn: tuple[float, float]
@@ -57,6 +59,23 @@ def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> 
         if mean > max(PATTERN_THERE * _error_of_mean(chance / scale**2), LEAST_PATTERN * noise):
             of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
             found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
+    return found
+
+
+def with_parity(
+    found: dict[str, dict[str, tuple[float, float]]],
+    channels: Sequence[Channel],
+    gain: np.ndarray,
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """The population with what even and odd rows or columns of a mono sensor differ by; its channel has one gain."""
+    for axis, lines in channels[0].lines.items():
+        if lines.parity_dn is None:
+            continue
+        variance, error, _ = channels[0].patterns[PATTERNS[axis]]
+        sigma = float(np.sqrt(max(variance, 0.0)))
+        alone = sigma / gain[0], error / max(2 * sigma, float(np.sqrt(error))) / gain[0]
+        parity = tuple(each / gain[0] for each in lines.parity_dn)
+        found[PATTERNS[axis]] = {"sigma": alone, **found.get(PATTERNS[axis], {}), "parity": parity}
     return found
 
 

@@ -35,7 +35,7 @@ def narrow_read_noise(counts) -> tuple[float, float]:
     y = counts.reshape(len(counts), -1)
     y = y[:, :: max(y.shape[1] // MOST_PIXELS, 1)].astype(np.float64)
     within = float(y.var(0, ddof=1).mean() - y.mean(1).var(ddof=1))  # offsets of frames are not pixel noise
-    lowest, highest = np.quantile(y, (1e-4, 1 - 1e-4))
+    lowest, highest = np.quantile(y, (1e-4, 1 - 1e-4), method="nearest")  # a count, not what lies between two
     if within > 1 or highest - lowest > MOST_COUNTS:
         return np.inf, np.inf
     codes = np.arange(lowest - 2, highest + 3)

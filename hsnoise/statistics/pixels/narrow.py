@@ -2,7 +2,8 @@
 
 Such a pixel holds one count most of the time: the mean of its counts is not its level, nor their variance that of its
 noise. All pixels together tell how levels and noise are distributed; what one of them may have follows by Bayes' rule
-(nonparametric maximum likelihood, Kiefer and Wolfowitz 1956, by expectation and maximisation).
+(maximum likelihood by expectation and maximisation; levels of any distribution, Kiefer and Wolfowitz 1956, and
+log-normal noise).
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hsnoise.statistics.narrow_noise import SIGMAS_DN, law_of_counts, narrow_read_noise
+from hsnoise.statistics.narrow_noise import law_of_counts, narrow_read_noise
 
 NARROW_DN = 0.4  # of noise, below which counts do not average to levels
 STEP_DN = 0.04  # of the grid of levels, and of what lines add to them
-SIGMAS = 12  # of the grid of noise
-ITERATIONS = 100  # of the distribution; few, so that it stays smooth
+SIGMAS, WIDEST = 21, 3.0  # of the grid of noise: how many, and how many times the usual one at most
+ITERATIONS = 300  # of the distribution
 SPREAD, WIDER = 0.3, 1e-3  # of the logarithms of the pixels' noise, and share of any level, before anything is learnt
 LEARNT_FROM = 200_000  # pixels
 AT_ONCE = 2000  # patterns
@@ -25,9 +26,9 @@ FAR = 1e-4  # quantile of the counts beyond which a pixel is not like the others
 UNLIKELY = 1e-6  # probability of a count, at least: tails are longer than normal ones
 LINES = 2  # times that what rows and columns add is measured
 PARTS = 4  # of the rows, by whose scatter errors are told
-COARSE = 0.01  # relative error beside chance: noise is not quite normal, and the grid is coarse
+COARSE, COARSEST = 0.01, 0.15  # relative error beside chance: noise is not quite normal, and the grid is coarse
 USUAL_DN = 0.25  # of noise, for which that is so
-FEW_FRAMES, OF_NOISE = 0.3, 0.08  # the same for a single frame; less of it for the noise
+FEW_FRAMES, OF_NOISE = 0.2, 0.08  # the same for a single frame; less of it for the noise
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,15 @@ class NarrowLaw(NamedTuple):
 def narrow_law(counts: np.ndarray) -> NarrowLaw:
     """How the pixels of darks of one exposure and colour [frame, row, column] are distributed."""
     found = np.array([_law_of(part) for part in np.array_split(counts, min(PARTS, counts.shape[1]), axis=1)])
-    mean, error = found.mean(0), found.std(0, ddof=1) / np.sqrt(len(found))
+    # In a part the means of columns are less certain, and what they lack passes for offsets: the whole counts.
+    mean, error = np.array(_law_of(counts)), found.std(0, ddof=1) / np.sqrt(len(found))
     few = np.full(len(mean), FEW_FRAMES)
     few[0] = OF_NOISE
     coarse = COARSE * max(1.0, USUAL_DN / float(mean[0])) ** 3  # the narrower, the coarser what counts tell
-    error = np.hypot(error, (coarse + few / len(counts)) * np.abs(mean))
+    error = np.hypot(error, np.minimum(coarse + few / len(counts), COARSEST) * np.abs(mean))
     law = NarrowLaw(*zip(mean.tolist(), error.tolist(), strict=True))
     # What few frames do not tell of it stays as it was assumed.
-    return law._replace(spread=(law.spread[0], float(np.hypot(law.spread[1], SPREAD / np.sqrt(len(counts))))))
+    return law._replace(spread=(law.spread[0], float(np.hypot(law.spread[1], SPREAD / len(counts)))))
 
 
 def _law_of(counts: np.ndarray) -> tuple[float, ...]:
@@ -91,10 +93,9 @@ def narrow_from_posterior(counts: np.ndarray, rng: np.random.Generator) -> Narro
     learnt, shape = _learnt(counts, rng), counts.shape[1:]
     level, sigma = learnt.grid.drawn(learnt.share, learnt.held, learnt.shift, rng)
     level = level.reshape(shape) + learnt.lines - STEP_DN * learnt.shift.reshape(shape)
-    codes, mean = learnt.grid.codes, learnt.mean
-    far = (mean < codes[0] + 1) | (mean > codes[-1] - 1)
+    far = (counts.min(0) < learnt.grid.codes[0]) | (counts.max(0) > learnt.grid.codes[-1])
     own = np.sqrt(np.maximum(counts.var(0, ddof=1), STEP_DN**2))
-    return Narrow(np.where(far, mean, level), np.where(far, own, sigma.reshape(shape)), learnt.slope)
+    return Narrow(np.where(far, learnt.mean, level), np.where(far, own, sigma.reshape(shape)), learnt.slope)
 
 
 @dataclass(frozen=True)
@@ -118,10 +119,11 @@ class _Learnt:
 def _learnt(counts: np.ndarray, rng: np.random.Generator) -> _Learnt:
     mean = counts.mean(0, dtype=np.float64)
     low, high = np.quantile(mean, (FAR, 1 - FAR))
-    codes = np.arange(np.floor(low) - 1, np.ceil(high) + 2)
-    held, grid = _histograms(counts, codes), _Grid.of(codes, low, high)
+    # The first code holds all that is below it, as 0 does in counts that are clipped there.
+    codes = np.arange(max(np.floor(low) - 1, min(float(counts.min()), 0.0)), np.ceil(high) + 2)
     usual, _ = narrow_read_noise(counts)
     usual = usual if np.isfinite(usual) else NARROW_DN
+    held, grid = _histograms(counts, codes), _Grid.of(codes, low, high, usual)
     slope, off = 1.0, np.clip(mean, low, high)
     off = off - off.mean()
     for _ in range(LINES):  # rows and columns shift the levels of a thousand pixels: they are known far better
@@ -164,9 +166,9 @@ class _Grid:
     sigma: np.ndarray
 
     @staticmethod
-    def of(codes: np.ndarray, low: float, high: float) -> _Grid:
+    def of(codes: np.ndarray, low: float, high: float, usual: float) -> _Grid:
         levels = np.arange(low - 0.5, high + 0.5, STEP_DN)
-        sigmas = np.geomspace(2 * SIGMAS_DN[0], SIGMAS_DN[-1], SIGMAS)
+        sigmas = usual * np.geomspace(1 / WIDEST, WIDEST, SIGMAS)
         return _Grid(codes, np.tile(levels, SIGMAS), np.repeat(sigmas, len(levels)))
 
     def likelihood(self, held: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -184,10 +186,20 @@ class _Grid:
         return (wide + WIDER) * np.exp(-0.5 * (np.log(self.sigma / usual) / SPREAD) ** 2)
 
     def learnt(self, share: np.ndarray, held: np.ndarray, shift: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The share of the pixels at each place: from what is assumed, patterns, and how many pixels have each."""
-        likelihood = self.likelihood(held, shift)
+        """The share of the pixels at each place: from what is assumed, patterns, and how many pixels have each.
+
+        Levels may have any distribution; that of noise is log-normal, and the same at all levels.
+        """
+        likelihood, log = self.likelihood(held, shift), np.log(self.sigma.reshape(SIGMAS, -1)[:, 0])
+        least = (log[1] - log[0]) / 2
         for _ in range(ITERATIONS):
             share = share * (likelihood.T @ (times / (likelihood @ share))) / times.sum()
+            table = share.reshape(SIGMAS, -1)
+            of_noise = table.sum(1)
+            middle = of_noise @ log
+            spread = max(float(np.sqrt(of_noise @ (log - middle) ** 2)), least)
+            of_noise = np.exp(-0.5 * ((log - middle) / spread) ** 2)
+            share = np.outer(of_noise / of_noise.sum(), table.sum(0)).ravel()
         return share
 
     def slope(self, share: np.ndarray, shift: np.ndarray) -> float:
