@@ -1,4 +1,4 @@
-"""Classes of pixels without the variance that is not their noise: of row gain, and of hits too small to be seen."""
+"""Classes of pixels without the variance that is not their noise: of row gain, hits too small to be seen, rounding."""
 
 from __future__ import annotations
 
@@ -10,17 +10,28 @@ from scipy.special import gammainc
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE
 from hsnoise.statistics.pixels.classes import Classes, Levels, classes_of, least_hit
 from hsnoise.statistics.pixels.hits import Rays
+from hsnoise.statistics.pixels.transfer import ROUNDING
 
 LEAST = 0.2  # of a variance that is left, however much is subtracted
 
 
 def classes_less(pixels: Levels, full_scale_dn: float, row_gain: tuple[float, float], rays: Rays | None) -> Classes:
     """The classes of the pixels of a channel; row_gain: its variance and the error of that."""
-    classes = classes_of(pixels, full_scale_dn)
+    classes = _uncertain_where_narrow(classes_of(pixels, full_scale_dn))
     if rays is not None:
         classes = _without_small_hits(classes, pixels.n_frames, rays)
     variance, error = row_gain
     return _without_streaks(classes, variance) if variance > ROW_GAIN_THERE * error else classes
+
+
+def _uncertain_where_narrow(classes: Classes) -> Classes:
+    """With the errors of variances narrower than a count: where a level lies between two counts changes them.
+
+    Rounding adds 1/12 DN^2 and a wave over the level of this amplitude (Widrow and Kollar, *Quantization Noise*, 2008).
+    """
+    own = np.maximum(classes.variance_dn2 - ROUNDING, 0.0)
+    wave = (1 / np.pi**2 + 4 * own) * np.exp(-2 * np.pi**2 * own)
+    return replace(classes, error_dn2=np.hypot(classes.error_dn2, wave / np.sqrt(2)))
 
 
 def _without_streaks(classes: Classes, row_gain: float) -> Classes:

@@ -190,7 +190,7 @@ def _channel(
     tail = tail_of(found, c) if is_plain and jumps is None else None
     raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
     floor, floor_error = _temporal(found, c, raised) if narrow is None else variance_of(narrow)
-    pixels = levels_of(found, c, without=jumping) if is_plain else None
+    pixels = levels_of(found, c, without=jumping) if register is None else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     of_columns = column_spectrum(shortest_of(found, c), found.shape[1], known_of_columns(found, c))
     banding = banding_in(found, c)

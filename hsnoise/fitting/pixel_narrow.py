@@ -8,20 +8,25 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from hsnoise.fitting.pixel_joint import UNKNOWN
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import shortest_of
 from hsnoise.statistics.pixels.narrow import NarrowLaw
+from hsnoise.statistics.pixels.population import Population
 from hsnoise.statistics.pixels.read_noise import NoiseSpread
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING
 
 LEAST_DN2 = 1e-4
+SHOT_NOISE = 0.3  # relative error of what pixels' dark currents, which differ, add to their noise
 MOVING = ("frame_offset", "row_noise", "column_noise")
 
 
 class Channel(Protocol):
     """A colour as `pixel_fit.Channel` has it."""
 
+    population: Population | None
+    offset_dn: tuple[float, float]
     values: np.ndarray
     covariance: np.ndarray
     black_dn: tuple[float, float]
@@ -37,14 +42,16 @@ def narrow_of(found: Survey, c: int) -> tuple[float, float] | None:
     return next((p.narrow_dn for p in shortest_of(found, c)), None)
 
 
-def law_of(found: Survey, c: int) -> NarrowLaw | None:
-    """How the pixels of a colour are distributed in the darks of most frames, if all its planes tell: their mean."""
-    laws = [p.narrow_law for group in found.darks for p in group.of(c) if p.narrow_law is not None]
-    if not laws or len(laws) < len(found.darks[0].of(c)):
+def law_of(found: Survey, c: int) -> tuple[NarrowLaw, float] | None:
+    """How the pixels of a colour are distributed in the darks of most frames, if all its planes tell: their mean, and
+    the exposure, s."""
+    told = [(p.narrow_law, group.exposure_s) for group in found.darks for p in group.of(c) if p.narrow_law is not None]
+    if not told or len(told) < len(found.darks[0].of(c)):
         return None
+    laws = [law for law, _ in told]
     values, errors = np.moveaxis(np.array(laws), -1, 0)
     together = zip(values.mean(0).tolist(), np.sqrt((errors**2).mean(0)).tolist(), strict=True)
-    return NarrowLaw(*together)
+    return NarrowLaw(*together), told[0][1]
 
 
 def variance_of(narrow: tuple[float, float]) -> tuple[float, float]:
@@ -54,28 +61,35 @@ def variance_of(narrow: tuple[float, float]) -> tuple[float, float]:
     return middle**2 + ROUNDING, max((bound**2 - middle**2) / 2, 1e-6)
 
 
-def with_law(one: C, law: NarrowLaw | None, narrow: tuple[float, float] | None) -> C:
+def with_law(one: C, told: tuple[NarrowLaw, float] | None, narrow: tuple[float, float] | None) -> C:
     """The colour with what the counts of its pixels tell, in levels instead of counts.
 
     Means of counts move by `slope` of what the levels do: so do offsets of frames, rows and columns.
     """
-    if law is None or narrow is None:
+    if told is None or narrow is None:
         return one
-    slope, of_slope = law.slope
+    (law, exposure_s), (slope, of_slope) = told, told[0].slope
     patterns = {name: _in_levels(of, slope, of_slope) for name, of in one.patterns.items()}
     shared = sum(max(patterns[name][0], 0.0) for name in MOVING if name in patterns)
     sigma, error = law.sigma
     alone = max(sigma**2 - shared, LEAST_DN2)
     values, covariance = one.values.copy(), one.covariance.copy()
-    values[1] += alone + ROUNDING - variance_of(narrow)[0]
-    covariance[1, 1] = (2 * sigma * error) ** 2
+    by_counts, of_counts = alone + ROUNDING - variance_of(narrow)[0], (2 * sigma * error) ** 2
+    if covariance[0, 0] < UNKNOWN**2:  # the gain is told by longer exposures: so is the shot noise of these
+        shot = values[0] * max(values[2], 0.0) * exposure_s
+        by_counts, of_counts = alone + ROUNDING - shot - values[1], of_counts + (SHOT_NOISE * shot) ** 2
+    if covariance[0, 0] >= UNKNOWN**2 or of_counts < covariance[1, 1]:
+        values[1] += by_counts
+        covariance[1], covariance[:, 1] = 0.0, 0.0
+        covariance[1, 1] = of_counts
     changed: dict[str, Any] = {
         "values": values,
         "covariance": covariance,
         "temporal_dn2": alone + ROUNDING,
         "patterns": patterns,
         "lines": {axis: _parity_in_levels(of, slope, of_slope) for axis, of in one.lines.items()},
-        "offset_dn": law.offset,
+        # Over exposures that grow, offsets are told from dark currents, which a single one holds, too.
+        "offset_dn": law.offset if one.population is None else one.offset_dn,
         "black_dn": (one.black_dn[0] - law.raised[0], float(np.hypot(one.black_dn[1], law.raised[1]))),
         "noise_spread": NoiseSpread(law.spread),
         "is_narrow": False,
