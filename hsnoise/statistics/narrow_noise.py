@@ -40,7 +40,7 @@ def narrow_read_noise(counts) -> tuple[float, float]:
         return np.inf, np.inf
     codes = np.arange(lowest - 2, highest + 3)
     share = np.array([(y == k).mean() for k in codes])
-    estimate = _estimate(codes, share, within)
+    estimate = _estimate(codes, share, within) if within > 0 else np.nan
     return estimate, float(np.fmax(_bound(codes, share, within), estimate))
 
 

@@ -18,17 +18,19 @@ from hsnoise.statistics.narrow_noise import law_of_counts, narrow_read_noise
 NARROW_DN = 0.4  # of noise, below which counts do not average to levels
 STEP_DN = 0.04  # of the grid of levels, and of what lines add to them
 SIGMAS, WIDEST = 21, 3.0  # of the grid of noise: how many, and how many times the usual one at most
-ITERATIONS = 300  # of the distribution
+ITERATIONS, FEWEST, WORK = 1500, 200, 1_500_000_000  # of the distribution; fewer the more patterns times places
 SPREAD, WIDER = 0.3, 1e-3  # of the logarithms of the pixels' noise, and share of any level, before anything is learnt
-LEARNT_FROM = 200_000  # pixels
+LEARNT_FROM, MOST = 200_000, 5_000_000  # pixels at most, and patterns times places
 AT_ONCE = 2000  # patterns
-FAR = 1e-4  # quantile of the counts beyond which a pixel is not like the others
+CORE, FAR, LEAST_DN = 0.05, 3.0, 0.2  # quantile of the means of pixels, and times its distance where others are far
 UNLIKELY = 1e-6  # probability of a count, at least: tails are longer than normal ones
-LINES = 2  # times that what rows and columns add is measured
+LINES, WIDEST_SHIFT_DN = 3, 3.0  # times that what rows and columns add is measured, and the most that they add
 PARTS = 4  # of the rows, by whose scatter errors are told
 COARSE, COARSEST = 0.01, 0.15  # relative error beside chance: noise is not quite normal, and the grid is coarse
 USUAL_DN = 0.25  # of noise, for which that is so
-FEW_FRAMES, OF_NOISE = 0.2, 0.08  # the same for a single frame; less of it for the noise
+NOT_NORMAL = 10.0  # times coarser where levels are far from normal
+LEAST_SLOPE = 0.2  # below which counts hardly move with levels, and tell nothing of what shifts them
+FEW_FRAMES, OF_NOISE = 0.2, 0.05  # the same for a single frame; less of it for the noise
 
 
 @dataclass(frozen=True)
@@ -58,57 +60,71 @@ class NarrowLaw(NamedTuple):
     slope: tuple[float, float]
 
 
-def narrow_law(counts: np.ndarray) -> NarrowLaw:
-    """How the pixels of darks of one exposure and colour [frame, row, column] are distributed."""
-    found = np.array([_law_of(part) for part in np.array_split(counts, min(PARTS, counts.shape[1]), axis=1)])
+def narrow_law(counts: np.ndarray) -> NarrowLaw | None:
+    """How the pixels of darks of one exposure and colour [frame, row, column] are distributed.
+
+    None where levels lie in the middle of a count, so that rounding hides them.
+    """
+    mean = np.array(_law_of(counts, ITERATIONS))
+    if mean[-1] < LEAST_SLOPE:
+        return None
     # In a part the means of columns are less certain, and what they lack passes for offsets: the whole counts.
-    mean, error = np.array(_law_of(counts)), found.std(0, ddof=1) / np.sqrt(len(found))
+    parts = np.array_split(counts, PARTS, axis=1)
+    error = np.std([_law_of(part, ITERATIONS // 3) for part in parts], axis=0, ddof=1) / np.sqrt(PARTS)
     few = np.full(len(mean), FEW_FRAMES)
     few[0] = OF_NOISE
     coarse = COARSE * max(1.0, USUAL_DN / float(mean[0])) ** 3  # the narrower, the coarser what counts tell
+    coarse *= 1.0 if np.isfinite(narrow_read_noise(counts)[0]) else NOT_NORMAL
     error = np.hypot(error, np.minimum(coarse + few / len(counts), COARSEST) * np.abs(mean))
     law = NarrowLaw(*zip(mean.tolist(), error.tolist(), strict=True))
     # What few frames do not tell of it stays as it was assumed.
-    return law._replace(spread=(law.spread[0], float(np.hypot(law.spread[1], SPREAD / len(counts)))))
+    spread = law.spread[0], float(np.hypot(law.spread[1], SPREAD / len(counts)))
+    offset = law.offset[0], float(np.hypot(law.offset[1], STEP_DN**2 / (2 * max(law.offset[0], STEP_DN))))
+    return law._replace(spread=spread, offset=offset)
 
 
-def _law_of(counts: np.ndarray) -> tuple[float, ...]:
-    learnt = _learnt(counts, np.random.default_rng(0))
+def _law_of(counts: np.ndarray, iterations: int) -> tuple[float, ...]:
+    learnt = _learnt(counts, np.random.default_rng(0), iterations)
     level, sigma, share = learnt.grid.level, learnt.grid.sigma, learnt.share
     middle, log = share @ level, np.log(sigma)
-    raised = learnt.mean.mean() - middle - STEP_DN * float(learnt.shift.mean())
+    raised = learnt.mean[~learnt.far].mean() - middle - STEP_DN * float(learnt.shift[~learnt.far.ravel()].mean())
     offset = share @ (level - middle) ** 2 - STEP_DN**2 / 12  # of the steps of what lines add
     rms, spread = share @ sigma**2, share @ (log - share @ log) ** 2
     return (*(float(np.sqrt(max(of, 0.0))) for of in (rms, spread, offset)), float(raised), learnt.slope)
 
 
+def usual_dn(narrow: tuple[float, float]) -> float:
+    """The noise, DN, of its estimate and bound: the bound where levels are not normal; infinite for wide noise."""
+    return narrow[0] if np.isfinite(narrow[0]) else narrow[1]
+
+
 def is_narrow(counts: np.ndarray) -> bool:
     """Whether the noise of darks [frame, row, column] is below a count."""
-    estimate, _ = narrow_read_noise(counts)
-    return bool(estimate < NARROW_DN)
+    return usual_dn(narrow_read_noise(counts)) < NARROW_DN
 
 
 def narrow_from_posterior(counts: np.ndarray, rng: np.random.Generator) -> Narrow:
     """Levels and noise of the pixels of darks of one exposure and colour [frame, row, column]."""
-    learnt, shape = _learnt(counts, rng), counts.shape[1:]
+    learnt, shape = _learnt(counts, rng, ITERATIONS), counts.shape[1:]
     level, sigma = learnt.grid.drawn(learnt.share, learnt.held, learnt.shift, rng)
     level = level.reshape(shape) + learnt.lines - STEP_DN * learnt.shift.reshape(shape)
-    far = (counts.min(0) < learnt.grid.codes[0]) | (counts.max(0) > learnt.grid.codes[-1])
     own = np.sqrt(np.maximum(counts.var(0, ddof=1), STEP_DN**2))
-    return Narrow(np.where(far, learnt.mean, level), np.where(far, own, sigma.reshape(shape)), learnt.slope)
+    level = np.where(learnt.far, learnt.mean, level)
+    return Narrow(level, np.where(learnt.far, own, sigma.reshape(shape)), learnt.slope)
 
 
 @dataclass(frozen=True)
 class _Learnt:
     """What all pixels together tell.
 
-    mean: of the counts of each pixel [row, column]; held: how often each holds each count [pixel, code]; lines: what
-    rows and columns add to levels [row, column], DN, and shift: the same in steps [pixel]; share: of the pixels at each
-    place of the grid.
+    mean: of the counts of each pixel [row, column]; far: whether they are beyond the others', as of hot pixels; held:
+    how often each holds each count [pixel, code]; lines: what rows and columns add to levels [row, column], DN, and
+    shift: the same in steps [pixel]; share: of the pixels at each place of the grid.
     """
 
     grid: _Grid
     mean: np.ndarray
+    far: np.ndarray
     held: np.ndarray
     lines: np.ndarray
     shift: np.ndarray
@@ -116,22 +132,28 @@ class _Learnt:
     slope: float
 
 
-def _learnt(counts: np.ndarray, rng: np.random.Generator) -> _Learnt:
+def _learnt(counts: np.ndarray, rng: np.random.Generator, iterations: int) -> _Learnt:
     mean = counts.mean(0, dtype=np.float64)
-    low, high = np.quantile(mean, (FAR, 1 - FAR))
+    below, middle, above = np.quantile(mean, (CORE, 0.5, 1 - CORE))
+    low = max(mean.min(), middle - FAR * max(middle - below, LEAST_DN))
+    high = min(mean.max(), middle + FAR * max(above - middle, LEAST_DN))
     # The first code holds all that is below it, as 0 does in counts that are clipped there.
     codes = np.arange(max(np.floor(low) - 1, min(float(counts.min()), 0.0)), np.ceil(high) + 2)
-    usual, _ = narrow_read_noise(counts)
-    usual = usual if np.isfinite(usual) else NARROW_DN
-    held, grid = _histograms(counts, codes), _Grid.of(codes, low, high, usual)
-    slope, off = 1.0, np.clip(mean, low, high)
-    off = off - off.mean()
-    for _ in range(LINES):  # rows and columns shift the levels of a thousand pixels: they are known far better
-        lines = (off.mean(1, keepdims=True) + off.mean(0, keepdims=True)) / slope
-        shift = np.rint(lines / STEP_DN).astype(int).ravel()
-        share = grid.learnt(grid.first(off - slope * lines, mean.mean(), usual), *_sample(held, shift, rng))
-        slope = grid.slope(share, shift)
-    return _Learnt(grid, mean, held, lines, shift, share, slope)
+    far = (counts.min(0) < codes[0]) | (counts.max(0) > codes[-1])
+    usual = min(usual_dn(narrow_read_noise(counts)), NARROW_DN)
+    held, grid, near = _histograms(counts, codes), _Grid.of(codes, low, high, usual), ~far.ravel()
+    clipped = np.clip(mean, low, high)
+    of_axes = [clipped.mean(axis, keepdims=True) for axis in (1, 0)]
+    lines, beside = sum(of - clipped.mean() for of in of_axes), clipped - sum(of_axes)
+    for rounds in np.linspace(iterations // 3, iterations, LINES).astype(int):
+        used, shift = lines, np.rint(lines / STEP_DN).astype(int).ravel()
+        some = _sample(held[near], shift[near], MOST // len(grid.level), rng)
+        share = grid.learnt(grid.first(beside, mean[~far].mean(), usual), *some, rounds)
+        # Rows and columns shift the levels of a thousand pixels: they are known far better than any of these.
+        shifts, means = grid.means(share)
+        lines = sum(of - of.mean() for of in (np.interp(each, means, shifts) for each in of_axes))
+    slope = max(grid.slope(share, shift), STEP_DN)
+    return _Learnt(grid, mean, far, held, used, shift, share, slope)
 
 
 def _histograms(counts: np.ndarray, codes: np.ndarray) -> np.ndarray:
@@ -141,10 +163,15 @@ def _histograms(counts: np.ndarray, codes: np.ndarray) -> np.ndarray:
     return np.bincount((place + len(codes) * np.arange(n)).ravel(), minlength=n * len(codes)).reshape(n, -1)
 
 
-def _sample(held: np.ndarray, shift: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patterns of some pixels, what lines add to them, and how many pixels have each."""
+def _sample(
+    held: np.ndarray, shift: np.ndarray, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Patterns of some pixels, at most so many, what lines add to them, and how many of these pixels have each."""
     some = rng.permutation(len(held))[:LEARNT_FROM]
     first, _, times = _patterns(held[some], shift[some])
+    while len(first) > most:
+        some = some[: int(0.9 * len(some) * most / len(first))]
+        first, _, times = _patterns(held[some], shift[some])
     return held[some][first], shift[some][first], times
 
 
@@ -185,14 +212,16 @@ class _Grid:
         wide = np.exp(-0.5 * ((self.level - level) / max(float(beside.std()), STEP_DN)) ** 2)
         return (wide + WIDER) * np.exp(-0.5 * (np.log(self.sigma / usual) / SPREAD) ** 2)
 
-    def learnt(self, share: np.ndarray, held: np.ndarray, shift: np.ndarray, times: np.ndarray) -> np.ndarray:
+    def learnt(
+        self, share: np.ndarray, held: np.ndarray, shift: np.ndarray, times: np.ndarray, rounds: int
+    ) -> np.ndarray:
         """The share of the pixels at each place: from what is assumed, patterns, and how many pixels have each.
 
         Levels may have any distribution; that of noise is log-normal, and the same at all levels.
         """
         likelihood, log = self.likelihood(held, shift), np.log(self.sigma.reshape(SIGMAS, -1)[:, 0])
         least = (log[1] - log[0]) / 2
-        for _ in range(ITERATIONS):
+        for _ in range(min(rounds, max(FEWEST, WORK // likelihood.size))):
             share = share * (likelihood.T @ (times / (likelihood @ share))) / times.sum()
             table = share.reshape(SIGMAS, -1)
             of_noise = table.sum(1)
@@ -201,6 +230,12 @@ class _Grid:
             of_noise = np.exp(-0.5 * ((log - middle) / spread) ** 2)
             share = np.outer(of_noise / of_noise.sum(), table.sum(0)).ravel()
         return share
+
+    def means(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shifts of all levels, DN, and the mean of the counts that each leads to."""
+        shifts = np.arange(-WIDEST_SHIFT_DN, WIDEST_SHIFT_DN, STEP_DN)
+        means = [self.codes @ law_of_counts(self.codes, self.level + of, self.sigma) @ share for of in shifts]
+        return shifts, np.maximum.accumulate(means)
 
     def slope(self, share: np.ndarray, shift: np.ndarray) -> float:
         """How much the mean of the counts of all pixels moves with their levels."""

@@ -17,7 +17,7 @@ from hsnoise.statistics.pixels.along_rows import Along, along_rows
 from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_of
 from hsnoise.statistics.pixels.look import Look, OddLines
-from hsnoise.statistics.pixels.narrow import NARROW_DN, NarrowLaw, narrow_law
+from hsnoise.statistics.pixels.narrow import NARROW_DN, NarrowLaw, narrow_law, usual_dn
 from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
@@ -28,6 +28,7 @@ NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is s
 FEWEST_STILL = 4  # frames
 MOST_CODES = 100_000  # counts of a frame that tell the step of its codes
 COLUMN_BLOCKS = 16  # the most outputs side by side that are looked for
+FEWEST_LINES = 16  # rows and columns of a plane whose counts tell how its pixels are distributed
 NARROW_DN2 = 0.25  # temporal variance below which rounding does not add 1/12 DN^2
 
 
@@ -358,7 +359,8 @@ def _of_most_frames(stack: FrameStack) -> int | None:
 
 
 def _law(plane: Plane, counts: np.ndarray) -> NarrowLaw | None:
-    return narrow_law(counts) if plane.narrow_dn is not None and plane.narrow_dn[0] < NARROW_DN else None
+    is_narrow = plane.narrow_dn is not None and usual_dn(plane.narrow_dn) < NARROW_DN
+    return narrow_law(counts) if is_narrow and min(counts.shape[1:]) >= FEWEST_LINES else None
 
 
 def _narrow(counts: np.ndarray, halves: Halves | None) -> tuple[float, float] | None:
