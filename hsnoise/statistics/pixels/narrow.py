@@ -65,16 +65,18 @@ def narrow_law(counts: np.ndarray) -> NarrowLaw | None:
 
     None where levels lie in the middle of a count, so that rounding hides them.
     """
-    mean = np.array(_law_of(counts, ITERATIONS))
+    narrow = narrow_read_noise(counts)
+    mean = np.array(_law_of(counts, usual_dn(narrow), ITERATIONS))
     if mean[-1] < LEAST_SLOPE:
         return None
     # In a part the means of columns are less certain, and what they lack passes for offsets: the whole counts.
     parts = np.array_split(counts, PARTS, axis=1)
-    error = np.std([_law_of(part, ITERATIONS // 3) for part in parts], axis=0, ddof=1) / np.sqrt(PARTS)
+    of_parts = [_law_of(part, usual_dn(narrow), ITERATIONS // 3) for part in parts]
+    error = np.std(of_parts, axis=0, ddof=1) / np.sqrt(PARTS)
     few = np.full(len(mean), FEW_FRAMES)
     few[0] = OF_NOISE
     coarse = COARSE * max(1.0, USUAL_DN / float(mean[0])) ** 3  # the narrower, the coarser what counts tell
-    coarse *= 1.0 if np.isfinite(narrow_read_noise(counts)[0]) else NOT_NORMAL
+    coarse *= 1.0 if np.isfinite(narrow[0]) else NOT_NORMAL
     error = np.hypot(error, np.minimum(coarse + few / len(counts), COARSEST) * np.abs(mean))
     law = NarrowLaw(*zip(mean.tolist(), error.tolist(), strict=True))
     # What few frames do not tell of it stays as it was assumed.
@@ -83,8 +85,8 @@ def narrow_law(counts: np.ndarray) -> NarrowLaw | None:
     return law._replace(spread=spread, offset=offset)
 
 
-def _law_of(counts: np.ndarray, iterations: int) -> tuple[float, ...]:
-    learnt = _learnt(counts, np.random.default_rng(0), iterations)
+def _law_of(counts: np.ndarray, usual: float, iterations: int) -> tuple[float, ...]:
+    learnt = _learnt(counts, usual, np.random.default_rng(0), iterations)
     level, sigma, share = learnt.grid.level, learnt.grid.sigma, learnt.share
     middle, log = share @ level, np.log(sigma)
     raised = learnt.mean[~learnt.far].mean() - middle - STEP_DN * float(learnt.shift[~learnt.far.ravel()].mean())
@@ -105,7 +107,8 @@ def is_narrow(counts: np.ndarray) -> bool:
 
 def narrow_from_posterior(counts: np.ndarray, rng: np.random.Generator) -> Narrow:
     """Levels and noise of the pixels of darks of one exposure and colour [frame, row, column]."""
-    learnt, shape = _learnt(counts, rng, ITERATIONS), counts.shape[1:]
+    usual = usual_dn(narrow_read_noise(counts))
+    learnt, shape = _learnt(counts, usual, rng, ITERATIONS), counts.shape[1:]
     level, sigma = learnt.grid.drawn(learnt.share, learnt.held, learnt.shift, rng)
     level = level.reshape(shape) + learnt.lines - STEP_DN * learnt.shift.reshape(shape)
     own = np.sqrt(np.maximum(counts.var(0, ddof=1), STEP_DN**2))
@@ -132,7 +135,8 @@ class _Learnt:
     slope: float
 
 
-def _learnt(counts: np.ndarray, rng: np.random.Generator, iterations: int) -> _Learnt:
+def _learnt(counts: np.ndarray, usual: float, rng: np.random.Generator, iterations: int) -> _Learnt:
+    """usual: noise of the pixels, DN, roughly."""
     mean = counts.mean(0, dtype=np.float64)
     below, middle, above = np.quantile(mean, (CORE, 0.5, 1 - CORE))
     low = max(mean.min(), middle - FAR * max(middle - below, LEAST_DN))
@@ -140,7 +144,7 @@ def _learnt(counts: np.ndarray, rng: np.random.Generator, iterations: int) -> _L
     # The first code holds all that is below it, as 0 does in counts that are clipped there.
     codes = np.arange(max(np.floor(low) - 1, min(float(counts.min()), 0.0)), np.ceil(high) + 2)
     far = (counts.min(0) < codes[0]) | (counts.max(0) > codes[-1])
-    usual = min(usual_dn(narrow_read_noise(counts)), NARROW_DN)
+    usual = min(usual, NARROW_DN)
     held, grid, near = _histograms(counts, codes), _Grid.of(codes, low, high, usual), ~far.ravel()
     clipped = np.clip(mean, low, high)
     of_axes = [clipped.mean(axis, keepdims=True) for axis in (1, 0)]
