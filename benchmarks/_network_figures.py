@@ -37,7 +37,7 @@ def draw_scores(results: dict[str, dict[str, Any]], ours: str, in_words: InWords
         axes[0, column].set_xscale("log")
         axes[0, column].set_xticks(lights, [in_words(light) for light in lights])
         axes[0, column].minorticks_off()
-    axes[0, 0].legend(fontsize=9)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=10)
     return figure
 
 
