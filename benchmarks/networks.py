@@ -298,22 +298,26 @@ def keep(path: Path, digest: str, measure: Callable[..., dict[str, Any]], *what:
         write_atomically(path, json.dumps({"digest": digest} | measure(*what), indent=1).encode())
 
 
-def write_results(folders: tuple[Path, Path], scenes: Sequence[Scene], ours: str, out: Path) -> list[Sheet]:
-    """The tables of all scores in these folders; tables, scores and pictures are written to `out`."""
+def write_tables(folders: tuple[Path, Path], ours: str, out: Path) -> tuple[dict[str, Path], list[Sheet]]:
+    """Files of all scores in these folders by method, and tables of them; tables and scores are written to `out`."""
     of_methods = {path.stem: path for folder in folders for path in sorted(folder.glob("*.json"))}
-    results = {
-        name: json.loads(of_methods[name].read_text()) for name in sorted(of_methods, key=lambda name: name != ours)
-    }
+    of_methods = {name: of_methods[name] for name in sorted(of_methods, key=lambda name: name != ours)}
+    results = {name: json.loads(path.read_text()) for name, path in of_methods.items()}
     sheets = tables(results, ours)
     write_atomically(out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
     write_atomically(out / "networks.csv", csv_of(results).encode())
+    return of_methods, sheets
+
+
+def write_figures(of_methods: dict[str, Path], scenes: Sequence[Scene], ours: str, out: Path) -> None:
+    """Curves of all scores, and the last frame of each clip in the middle of the light by all methods."""
+    results = {name: json.loads(path.read_text()) for name, path in of_methods.items()}
     write_figure(out / "networks.png", draw_scores(results, ours, scenes[0].camera.in_words), dpi=110)
     middle = sorted({scene.mean_e for scene in scenes})[LEVELS // 2]
-    pictures = {name: of_methods[name].with_suffix("") for name in results}
+    pictures = {name: path.with_suffix("") for name, path in of_methods.items()}
     for scene in scenes:
         if scene.mean_e == middle:
             write_figure(out / f"{scene.clip}.png", draw_scene(scene, pictures), dpi=110)
-    return sheets
 
 
 def run(options: argparse.Namespace) -> None:
@@ -324,10 +328,11 @@ def run(options: argparse.Namespace) -> None:
         scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
         for number, (clip, level) in enumerate(tasks)
     ]
-    folders, found = measures(setting, scenes, options)
+    (folders, found), ours = measures(setting, scenes, options), OURS + suffix_of(options.noise)
     for measure in found:
         measure()
-        sheets = write_results(folders, scenes, OURS + suffix_of(options.noise), options.out)
+        of_methods, sheets = write_tables(folders, ours, options.out)
+    write_figures(of_methods, scenes, ours, options.out)
     for sheet in sheets:
         Console(width=150).print(sheet.rich())
 

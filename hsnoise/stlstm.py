@@ -33,13 +33,9 @@ L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equatio
 def convolve(x: jax.Array, weight: jax.Array) -> jax.Array:
     """Convolution of x [batch, row, column, in] with weight [row, column, in, out], same size, zeros outside.
 
-    On a CPU its derivative with respect to the weight is a sum of matrix products, one per kernel element: XLA's own, a
-    convolution with a kernel as large as the image, is ten times slower there inside loops.
+    Its derivative with respect to the weight is a sum of matrix products, one per kernel element. XLA's own, a
+    convolution with a kernel as large as the image, is ten times slower inside loops on a CPU.
     """
-    return _convolved(x, weight)
-
-
-def _convolved(x: jax.Array, weight: jax.Array) -> jax.Array:
     return jax.lax.conv_general_dilated(x, weight, (1, 1), "SAME", dimension_numbers=LAYOUT)
 
 
@@ -50,11 +46,7 @@ def _forward(x, weight):
 def _backward(residuals, slope):
     x, weight = residuals
     turned = jnp.flip(weight, (0, 1)).swapaxes(2, 3)
-    by_weight = jax.lax.platform_dependent(x, weight, slope, cpu=_products, default=_own_derivative)
-    return _convolved(slope, turned), by_weight
-
-
-def _products(x: jax.Array, weight: jax.Array, slope: jax.Array) -> jax.Array:
+    by_x = jax.lax.conv_general_dilated(slope, turned, (1, 1), "SAME", dimension_numbers=LAYOUT)
     height, width = weight.shape[:2]
     rows, columns = x.shape[1:3]
     above, left = (height - 1) // 2, (width - 1) // 2
@@ -63,11 +55,7 @@ def _products(x: jax.Array, weight: jax.Array, slope: jax.Array) -> jax.Array:
         [jnp.einsum("bhwi,bhwo->io", padded[:, r : r + rows, c : c + columns], slope) for c in range(width)]
         for r in range(height)
     ]
-    return jnp.stack([jnp.stack(row) for row in by_weight])
-
-
-def _own_derivative(x: jax.Array, weight: jax.Array, slope: jax.Array) -> jax.Array:
-    return jax.vjp(lambda weight: _convolved(x, weight), weight)[1](slope)[0]
+    return by_x, jnp.stack([jnp.stack(row) for row in by_weight])
 
 
 convolve.defvjp(_forward, _backward)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -63,7 +63,7 @@ class Plane:
     blocks_dn: np.ndarray | None
     neighbours_share: float
     narrow_dn: tuple[float, float] | None
-    narrow_law: NarrowLaw | None = None
+    narrow_law: NarrowLaw | None
 
 
 @dataclass(frozen=True)
@@ -250,14 +250,9 @@ def _group(
     seen.kept.clear()  # it is there twice
     half = int(np.searchsorted(rows[::step], stack.shape[0] / 2)) if looks_for_row_groups else None
     planes = tuple(
-        _plane(seen.sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half)
+        _plane(seen.sums[p], kept[:, p // step :: step, p % step :: step], tile.ravel()[p], step, half, looks_at_counts)
         for p in range(step**2)
     )
-    if looks_at_counts:
-        planes = tuple(
-            replace(one, narrow_law=_law(one, kept[:, p // step :: step, p % step :: step]))
-            for p, one in enumerate(planes)
-        )
     conditions = float(stack.exposure_s[i]), stack.kind[i], n
     first_row = 0 if stack.window is None else stack.window[0]
     banding, means = planes[0].banding.get("row"), seen.row_means
@@ -276,12 +271,15 @@ def _group(
     return Group(*conditions, *shares, seen.odd, planes, *of_frames), seen.highest, of_codes
 
 
-def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int, half: int | None) -> Plane:
+def _plane(
+    sums: PlaneSums, counts: np.ndarray, channel: int, step: int, half: int | None, looks_at_counts: bool
+) -> Plane:
     """half: sampled rows of the plane in the first half of the frame; None where blocks are not looked at."""
     n, (h, w) = sums.n_frames, sums.shape
     halves = halves_of(counts) if n > 1 else None
     row_frame, column_frame = np.stack(sums.rows) / w, np.stack(sums.columns) / h
     reference, components = float(sums.reference or 0), _components(sums, halves)
+    narrow = _narrow(counts, halves)
     return Plane(
         channel=int(channel),
         row_mean_dn=row_frame.mean(0) + reference,
@@ -296,7 +294,8 @@ def _plane(sums: PlaneSums, counts: np.ndarray, channel: int, step: int, half: i
         single_dn=counts[0].ravel().astype(np.float32) if n == 1 else None,
         blocks_dn=None if half is None or n == 1 else _blocks(counts, half),
         neighbours_share=_neighbours_share(counts),
-        narrow_dn=_narrow(counts, halves),
+        narrow_dn=narrow,
+        narrow_law=_law(narrow, counts) if looks_at_counts else None,
     )
 
 
@@ -358,8 +357,8 @@ def _of_most_frames(stack: FrameStack) -> int | None:
     return min(darks, key=lambda i: (-stack.n_frames[i], stack.exposure_s[i]), default=None)
 
 
-def _law(plane: Plane, counts: np.ndarray) -> NarrowLaw | None:
-    is_narrow = plane.narrow_dn is not None and usual_dn(plane.narrow_dn) < NARROW_DN
+def _law(narrow: tuple[float, float] | None, counts: np.ndarray) -> NarrowLaw | None:
+    is_narrow = narrow is not None and usual_dn(narrow) < NARROW_DN
     return narrow_law(counts) if is_narrow and min(counts.shape[1:]) >= FEWEST_LINES else None
 
 
