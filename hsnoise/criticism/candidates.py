@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.arguments import listed
-from hsnoise._core.types import channel_index
+from hsnoise._core.types import RandomKey, channel_index
 from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -34,7 +34,7 @@ TINY_ERROR = 1e-9  # of statistics whose scatter only draws can show
 Suspect = AbstractEffect | type[AbstractEffect]  # what a user may pass
 
 
-def facts_of(model: NoiseModel, portion: Portion, seed: int) -> CaptureFacts:
+def facts_of(model: NoiseModel, portion: Portion, seed: RandomKey | int) -> CaptureFacts:
     """What effects need to know about a capture and its fitted model to propose themselves."""
     part = portion.frames
     darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]

@@ -18,6 +18,8 @@ import numpy as np
 
 from hsnoise._core.arguments import callback, seed_of, whole_number
 from hsnoise._core.forking import check_not_forked
+from hsnoise._core.keys import key_of, named_key
+from hsnoise._core.types import RandomKey
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import (
     Suspect,
@@ -108,12 +110,25 @@ def diagnosed(
 
 
 def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -> Diagnosis:
+    """What draws of the model show. What they show weakly, where the model fits, other draws must show, too.
+
+    From 64 draws, neither how statistics scatter together nor the limit of chance is known well.
+    """
+    found, worst = _by_draws(fit, portion, candidates, draws, key_of("seed", seed), tick)
+    if found.best is None or worst > rules.MISFIT or found.ranking[0].score > rules.MARKOV_UP_TO:
+        return found
+    again, _ = _by_draws(fit, portion, candidates, draws, named_key(key_of("seed", seed), "again"), tick)
+    return again if again.verdict == Verdict.NOTHING_MISSING else found
+
+
+def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, tick) -> tuple[Diagnosis, float]:
+    """A diagnosis, and how far off the worst group of statistics is without any candidate."""
     model = fit.params if isinstance(fit, FitResult) else fit
     facts = facts_of(model, portion, seed)
     own = check_makers(candidates, model, portion.frames, facts)
     unseen = [one.name for one in candidates if one.name not in own]
     if unseen:
-        warnings.warn(f"candidates: {', '.join(unseen)} not tried: this capture cannot show it", stacklevel=4)
+        warnings.warn(f"candidates: {', '.join(unseen)} not tried: this capture cannot show it", stacklevel=5)
     makers = {name: maker for name, maker in built_in(facts).items() if name not in own}
     log.info(
         "Drawing %d captures from the model, and each of %d candidates on top of it", draws, len(makers) + len(own)
@@ -127,13 +142,14 @@ def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -
     found, judged = _found(Search(bench, evidence, makers, own), fit, draws, seed)
     log.info("Diagnosis: %s", found.conclusion)
     log.debug("%s", found)
+    worst = evidence.misfit(null)
     if found.verdict != Verdict.UNEXPLAINED:
-        return found
+        return found, worst
     prints, variance = [one.of for one in judged], np.diagonal(base.distribution.covariance)
-    return replace(found, nearest=nearest(prints, found.ranking, evidence, slopes, variance))
+    return replace(found, nearest=nearest(prints, found.ranking, evidence, slopes, variance)), worst
 
 
-def _found(search: Search, fit, draws: int, seed: int) -> tuple[Diagnosis, list[Judged]]:
+def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis, list[Judged]]:
     """The diagnosis, and all candidates as they were judged, best first."""
     evidence = search.evidence
     judged = search.likely(search.glance())
@@ -177,7 +193,7 @@ def _scores(judged: Iterable[Judged]) -> str:
     return ", ".join(f"{one.of.name} {one.score:.1f} nats" for one in judged)
 
 
-def _limit(judged: list[Judged], draws: int, seed: int, search: Search) -> float:
+def _limit(judged: list[Judged], draws: int, seed: RandomKey, search: Search) -> float:
     """Score that chance hardly ever exceeds in such a capture, from as many fresh draws of the model."""
     simulator = replace(search.bench.simulator, key=key_for(seed, Purpose.CHANCE), kept={})
     fresh = simulator.draws(simulator.model, draws)

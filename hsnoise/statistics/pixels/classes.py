@@ -149,7 +149,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
 
 def _half(pixels: Levels, half: int) -> _Half:
     frames = (pixels.n_frames + 1 - half) // 2
-    own = np.sqrt(1 - 1 / np.maximum(frames, 2))[:, None]
+    own = np.sqrt(1 - 1 / np.maximum(frames, 2))[:, None].astype(pixels.peak.dtype)
     return _Half(pixels.level[:, half], pixels.variance[:, half], pixels.peak[:, half] / own)
 
 
@@ -164,7 +164,10 @@ def least_hit(sigma_dn: np.ndarray, n_frames: np.ndarray) -> np.ndarray:
 def slope_over(exposure_s: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Growth of levels [exposure, ...] with exposure, DN/s, by least squares."""
     centred = exposure_s - exposure_s.mean()
-    return np.tensordot(centred / (centred @ centred), level, 1)
+    growth = np.zeros(np.shape(level)[1:])
+    for weight, of in zip(centred / (centred @ centred), level, strict=True):
+        growth += weight * of  # one exposure after the other: no copy of all in double precision
+    return growth
 
 
 def hot_from(growth: np.ndarray) -> float:

@@ -7,6 +7,7 @@ from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.pixels.survey import Survey, survey
 
 PROBE_PIXELS, PROBE_FRAMES = 1 << 20, 16  # of each exposure
+OF_LARGE = 1 << 19  # pixels of each exposure of larger frames: the probe is in memory beside the survey of the whole
 
 
 def surveyed(stack: FrameStack) -> Survey:
@@ -17,7 +18,7 @@ def surveyed(stack: FrameStack) -> Survey:
     frames = slice(0, PROBE_FRAMES)
     if rows * columns <= PROBE_PIXELS:
         return survey(stack if max(stack.n_frames) <= PROBE_FRAMES else stack.select(frames=frames))
-    kept = max(PROBE_PIXELS // columns // 4 * 4, 32)
+    kept = max(OF_LARGE // columns // 4 * 4, 32)
     first = max((rows - kept) // 8 * 4, 0)
     return survey(stack.select(rows=(first, min(first + kept, rows)), frames=frames))
 
