@@ -110,19 +110,23 @@ def diagnosed(
 
 
 def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -> Diagnosis:
-    """What draws of the model show. What they show weakly, where the model fits, other draws must show, too.
+    """What draws of the model show. What they show weakly, where the model fits, is judged by twice as many.
 
     From 64 draws, neither how statistics scatter together nor the limit of chance is known well.
     """
-    found, worst = _by_draws(fit, portion, candidates, draws, key_of("seed", seed), tick)
-    if found.best is None or worst > rules.MISFIT or found.ranking[0].score > rules.MARKOV_UP_TO:
+    found, evidence = _by_draws(fit, portion, candidates, draws, key_of("seed", seed), tick)
+    if found.best is None or evidence.misfit(evidence.null) > rules.MISFIT or found.best.score > rules.MARKOV_UP_TO:
         return found
-    again, _ = _by_draws(fit, portion, candidates, draws, named_key(key_of("seed", seed), "again"), tick)
-    return again if again.verdict == Verdict.NOTHING_MISSING else found
+    again, other = _by_draws(fit, portion, candidates, draws, named_key(key_of("seed", seed), "again"), tick)
+    score = found.best.score + next((one.score for one in again.ranking if one.name == found.best.name), 0.0)
+    if score > evidence.limit + other.limit:
+        return found
+    left = what_remains(evidence, evidence.null)
+    return replace(found, verdict=Verdict.NOTHING_MISSING, best=None, names=(), advice="", unexplained=left)
 
 
-def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, tick) -> tuple[Diagnosis, float]:
-    """A diagnosis, and how far off the worst group of statistics is without any candidate."""
+def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, tick) -> tuple[Diagnosis, Evidence]:
+    """A diagnosis, and what it was made from."""
     model = fit.params if isinstance(fit, FitResult) else fit
     facts = facts_of(model, portion, seed)
     own = check_makers(candidates, model, portion.frames, facts)
@@ -139,18 +143,17 @@ def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, ti
     has_flats = "flat" in portion.frames.kind
     null = shrunk(base.own_z(), slopes)
     evidence = Evidence(bench.z, null, base.names, base.groups, len(makers) + len(own), has_flats=has_flats)
-    found, judged = _found(Search(bench, evidence, makers, own), fit, draws, seed)
+    found, judged, evidence = _found(Search(bench, evidence, makers, own), fit, draws, seed)
     log.info("Diagnosis: %s", found.conclusion)
     log.debug("%s", found)
-    worst = evidence.misfit(null)
     if found.verdict != Verdict.UNEXPLAINED:
-        return found, worst
+        return found, evidence
     prints, variance = [one.of for one in judged], np.diagonal(base.distribution.covariance)
-    return replace(found, nearest=nearest(prints, found.ranking, evidence, slopes, variance)), worst
+    return replace(found, nearest=nearest(prints, found.ranking, evidence, slopes, variance)), evidence
 
 
-def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis, list[Judged]]:
-    """The diagnosis, and all candidates as they were judged, best first."""
+def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis, list[Judged], Evidence]:
+    """The diagnosis, all candidates as they were judged, best first, and the evidence with its limit of chance."""
     evidence = search.evidence
     judged = search.likely(search.glance())
     log.info("Most likely at first: %s", _scores(judged[:WORST]))
@@ -181,7 +184,7 @@ def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis,
             found = verdict_of(sorted([candidate, *others], key=lambda c: -c.score), None, evidence, with_each)
             if found.best is candidate:
                 found = replace(found, unexplained=what_remains(left, distribution))
-    return found, judged
+    return found, judged, evidence
 
 
 def _leaves_something(first: Judged, evidence: Evidence) -> bool:
