@@ -132,3 +132,16 @@ def test_a_gain_from_one_exposure_is_doubted(exposure_s, light, rng):
     found = hsnoise.fit(counts, exposure_s=exposure_s, shutter="global", pixels="alike")
     assert found.has_gain and found.conclusion.light == light
     assert any("All darks have one exposure" in doubt for doubt in found.doubts)
+
+
+def test_noise_of_counts_that_are_clipped_is_not_trusted():
+    """Black at 0: half of the counts of the shortest darks are 0, and no gain shows."""
+    rng = np.random.default_rng(4)
+    level, noise = rng.normal(0, 0.5, (96, 128)), rng.lognormal(np.log(3), 0.25, (96, 128))
+    counts = [
+        np.maximum(np.rint(level + 5 * t + noise * rng.normal(size=(8, 96, 128))), 0).astype(np.uint16)
+        for t in (0.1, 1, 4)
+    ]
+    found = hsnoise.fit(counts, exposure_s=(0.1, 1, 4), cfa="mono", shutter="rolling", white_level=4095)
+    assert found.conclusion.light == Light.RED
+    assert any("of the counts are clipped at 0" in doubt for doubt in found.doubts)

@@ -50,6 +50,8 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
     if args.out.is_dir():
         raise ValueError(f"--out: expected a file, but {args.out} is a folder")
+    if args.clean is not None and Path(args.clean).exists() and args.out.exists() and args.out.samefile(args.clean):
+        raise ValueError(f"--out: {args.out} is the image of --clean, which would be lost")
     model = model_of(args.model, "MODEL")
     exposures_s = args.exposure or [model.exposure_s]
     shape = args.shape or SAMPLE_SHAPE

@@ -18,7 +18,7 @@ def in_order(path: Path) -> list[Any]:
     dark2 comes before dark10, and dark_0.05s before dark_0.1s; with several points (1.2.10) each separates two numbers.
     """
     parts = re.split(r"((?<![\d.])\d+\.\d+(?![\d.])|\d+)", path.stem)
-    return [*(float(part) if i % 2 else part.lower() for i, part in enumerate(parts)), path.suffix.lower()]
+    return [[float(part) if i % 2 else part.lower() for i, part in enumerate(parts)], path.suffix.lower()]
 
 
 class LazyFrames:

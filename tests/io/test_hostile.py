@@ -156,6 +156,55 @@ def test_a_model_with_many_effects_is_refused_at_once(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("card", "value", "expected"),
+    [
+        ("NAXIS1", -24, "NAXIS1: expected a size of 0 or more, got -24"),
+        ("NAXIS", 9, "a header lacks .*NAXIS4"),
+        ("BITPIX", 17, "BITPIX: expected one of 8, 16, .*, got 17"),
+        ("BZERO", "'abc'", "BZERO: expected a number, got 'abc'"),
+    ],
+)
+def test_fits(tmp_path, card, value, expected):
+    fits.writeto(tmp_path / "a.fits", counts(4), fits.Header({"EXPTIME": 1.0}))
+    content = (tmp_path / "a.fits").read_bytes()
+    at = content.index(f"{card:8s}=".encode())
+    (tmp_path / "a.fits").write_bytes(content[:at] + f"{card:8s}= {value:>20}".encode() + content[at + 30 :])
+    with pytest.raises(ValueError, match=f"cannot read .*a.fits: {expected}"):
+        hsnoise.load(tmp_path / "a.fits")
+
+
+def test_one_nan_is_no_average(tmp_path):
+    values = np.stack([counts(4), counts(4)]).astype(np.float64)
+    values[0, 0, 0, 0] = np.nan
+    np.savez(tmp_path / "a.npz", counts=values, exposure_s=[1.0, 4.0])
+    with pytest.raises(ValueError, match="counts must be finite, got NaN"):
+        hsnoise.fit(tmp_path / "a.npz", black_level=0, white_level=4095)
+
+
+def test_names_of_which_one_is_the_other_with_a_number(tmp_path):
+    for place in ("dark.fits", "dark1.fits", "darks/dark.fits", "darks2/dark.fits"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        fits.writeto(tmp_path / place, counts(1)[0], fits.Header({"EXPTIME": 1.0}))
+    assert hsnoise.load(tmp_path, progress=False).n_frames == (4,)
+
+
+def test_a_link_to_nothing_is_set_aside(tmp_path, capsys):
+    for name in "ac":
+        fits.writeto(tmp_path / f"{name}.fits", counts(1)[0], fits.Header({"EXPTIME": 1.0}))
+    (tmp_path / "b.fits").symlink_to(tmp_path / "gone.fits")
+    assert main(["inspect", str(tmp_path), "--verbose"]) in (0, 1)
+    assert "b.fits was set aside: a link to nothing, or no file" in "".join(capsys.readouterr())
+
+
+def test_an_image_is_not_overwritten_by_what_is_drawn_from_it(tmp_path, capsys):
+    np.save(tmp_path / "scene.npy", np.full((8, 8), 5.0, np.float32))
+    before, scene = (tmp_path / "scene.npy").read_bytes(), str(tmp_path / "scene.npy")
+    assert main(["sample", "canon_5d3", "--clean", scene, "--out", scene]) == 2
+    assert "is the image of --clean, which would be lost" in capsys.readouterr().err
+    assert (tmp_path / "scene.npy").read_bytes() == before
+
+
+@pytest.mark.parametrize(
     ("options", "expected"),
     [
         (["--seed", "9" * 30], "--seed: expected at most 2147483648, got 9"),

@@ -41,6 +41,7 @@ ADD = "Add flats (pairs of evenly lit frames at several brightnesses), or darks 
 OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
+MOST_CLIPPED = 0.02  # share of counts: where it is cut so near, the noise comes out 2 % too small
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
 LONG_S = 0.5  # of the only dark exposure, from which its dark signal may show
 LEAST_STEPS = 0.8  # of a step of the codes: with less noise rounding is no noise of its own
@@ -228,12 +229,21 @@ def _by_shape_alone(result: FitResult) -> Iterator[str]:
 
 
 def _clipped(result: FitResult, found: Survey) -> Iterator[str]:
-    """Clipping of pixels whose noise differs: the correction assumes one noise for all pixels of a class."""
-    if result.transfer is None or not result.has_gain:
+    """Clipping of pixels whose noise differs: the correction assumes one noise for all pixels of a class.
+
+    Without a gain there are no classes, and noise and level are those of the clipped counts.
+    """
+    if result.transfer is None:
         return
     for c, _ in enumerate(found.channels):
         clipped = max((group.clipped_share[c] for group in found.repeated_darks), default=0.0)
-        if clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
+        if not result.has_gain and clipped > MOST_CLIPPED:
+            yield (
+                f"{100 * clipped:.2g} % of the counts are clipped at 0: read noise comes out too small, the black level"
+                " too high, and growth with exposure is hidden. Raise the black level."
+            )
+            return
+        if result.has_gain and clipped > CLIPPED_SHARE and noise_spread(found, c) > NOISE_SPREAD:
             yield (
                 f"{100 * clipped:.2g} % of the counts are clipped at 0 and pixels differ in noise: the correction for"
                 " clipping is uncertain, and gain and read noise may be off by several percent. Raise the black level."

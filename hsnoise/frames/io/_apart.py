@@ -91,6 +91,7 @@ def _is_master(recording: Recording, root: Path) -> bool:
     if np.dtype(recording.counts.dtype).kind != "f":
         return False
     some = np.asarray(recording.counts[0])[::THIN, ::THIN]
+    some = some[np.isfinite(some)]  # NaN is no average, and is refused with the whole
     return bool((some != np.rint(some)).any())
 
 

@@ -80,7 +80,10 @@ def _below(root: Path) -> tuple[list[Path], list[str]]:
         told += [f"{(Path(folder) / name).relative_to(root)}/ was passed over because of its name" for name in passed]
         inside[:] = [name for name in inside if name not in passed and not name.startswith((".", "hsnoise-"))]
         found += [Path(folder) / name for name in names if not name.startswith(".")]
-    chosen = [path for path in found if reader_name(path)]
+    known = [path for path in found if reader_name(path)]
+    chosen = [path for path in known if path.is_file()]
+    lost = [path.relative_to(root) for path in known if not path.is_file()]
+    told += [f"{path} was set aside: a link to nothing, or no file" for path in lost]
     return sorted(chosen, key=lambda path: [in_order(Path(part)) for part in path.relative_to(root).parts]), told
 
 

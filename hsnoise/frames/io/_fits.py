@@ -18,6 +18,7 @@ from hsnoise.frames.io._header import check_exposures, described
 from hsnoise.frames.io._recording import LEAST_DECLARED, MOST_PACKED, Recording, check_held, lazy_frames, naming
 
 MOST_COLUMNS = 999
+BITS = (8, 16, 32, 64, -32, -64)
 EXPOSURE_FROM = "EXPTIME, EXPOSURE or EXP_TIME in the FITS header"
 
 
@@ -34,8 +35,11 @@ def read(path: Path, hdu: int | str | None = None) -> list[Recording]:
     """
     with naming(path), warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with _opened(path, disable_image_compression=True) as file:
-            _check_tables(file)
+        try:
+            with _opened(path, disable_image_compression=True) as file:
+                _check_headers(file)
+        except KeyError as card:
+            raise ValueError(f"a header lacks {card}") from card
         with _opened(path) as file:
             found = _recording(path, file, hdu)
         # Astropy only warns of a file that is cut short, and its frames fail when they are read.
@@ -49,7 +53,12 @@ def read(path: Path, hdu: int | str | None = None) -> list[Recording]:
 
 def _opened(path: Path, **options: Any) -> fits.HDUList:
     if path.suffix.lower() != ".gz":
-        return fits.open(path, memmap=False, **options)
+        stream = path.open("rb")
+        try:
+            return fits.open(stream, memmap=False, **options)
+        except BaseException:
+            stream.close()  # Astropy does not
+            raise
     state = path.stat()
     return fits.open(io.BytesIO(_unpacked(path, (state.st_size, state.st_mtime_ns))), **options)
 
@@ -64,9 +73,23 @@ def _unpacked(path: Path, state: tuple[int, int]) -> bytes:
     return content
 
 
-def _check_tables(file: fits.HDUList) -> None:
-    """Raise ValueError for tables of more columns than FITS allows: Astropy would look for each."""
+def _check_headers(file: fits.HDUList) -> None:
+    """Raise ValueError for headers with which Astropy would not come to an end, or fail without a reason.
+
+    Sizes below 0, over which it goes back and reads the same again, tables of more columns than FITS allows, each of
+    which it looks for, and numbers of another type. HDUs are read one after the other, as they are checked.
+    """
     for hdu in file:
+        for card in ("BZERO", "BSCALE", "BITPIX", "NAXIS"):
+            number = hdu.header.get(card, 0)
+            if isinstance(number, bool) or not isinstance(number, (int, float)):
+                raise ValueError(f"{card}: expected a number, got {number!r:.60}")
+        if hdu.header.get("BITPIX", 8) not in BITS:
+            raise ValueError(f"BITPIX: expected one of {', '.join(map(str, BITS))}, got {hdu.header['BITPIX']!r:.60}")
+        for i in range(1, int(hdu.header.get("NAXIS", 0)) + 1):
+            size = hdu.header.get(f"NAXIS{i}")
+            if isinstance(size, bool) or not (isinstance(size, int) and size >= 0):
+                raise ValueError(f"NAXIS{i}: expected a size of 0 or more, got {size!r:.60}")
         n = hdu.header.get("TFIELDS", 0)
         if not (isinstance(n, int) and 0 <= n <= MOST_COLUMNS):
             raise ValueError(f"TFIELDS: expected 0 to {MOST_COLUMNS} columns, got {n!r:.60}")
