@@ -145,3 +145,16 @@ def test_noise_of_counts_that_are_clipped_is_not_trusted():
     found = hsnoise.fit(counts, exposure_s=(0.1, 1, 4), cfa="mono", shutter="rolling", white_level=4095)
     assert found.conclusion.light == Light.RED
     assert any("of the counts are clipped at 0" in doubt for doubt in found.doubts)
+
+
+@pytest.mark.parametrize("second", [1.0, 1.1])
+def test_greens_of_two_gains_are_told(second):
+    rng, cell = np.random.default_rng(5), np.array([[1.0, 1.0], [second, 1.0]])
+    gain, dark = np.tile(cell, (48, 64)), 20 * rng.lognormal(0, 0.4, (96, 128))
+    counts = [
+        np.rint(100 + gain * (rng.poisson(dark * t, (8, 96, 128)) + 2.5 * rng.normal(size=(8, 96, 128))))
+        for t in (0.1, 1, 4)
+    ]
+    found = hsnoise.fit([c.astype(np.uint16) for c in counts], exposure_s=(0.1, 1, 4), cfa="RGGB", shutter="rolling")
+    told = [doubt for doubt in found.doubts if "of both together" in doubt]
+    assert len(told) == (second > 1) and all("channel G" in doubt for doubt in told)

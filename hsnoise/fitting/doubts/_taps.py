@@ -1,4 +1,4 @@
-"""Outputs that read blocks of the frame: what they are, and that numbers of the table are means over them."""
+"""Outputs that read parts of the frame: what they are, and that numbers of the table are means over them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from hsnoise.fitting.result import FitResult
+from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps
 
 DIFFER = 0.02  # largest relative difference of gains that is no doubt
+SIGMAS = 5.0  # standard errors beyond which the pixels of a channel differ
 
 
-def gains_differ(result: FitResult) -> Iterator[str]:
+def gains_differ(result: FitResult, found: Survey) -> Iterator[str]:
     """That no pixel may have the gain of the table."""
+    yield from outputs_differ(result)
+    yield from _of_greens(found)
+
+
+def outputs_differ(result: FitResult) -> Iterator[str]:
+    """That outputs have gains of their own."""
     taps = _taps(result)
     if taps is None or not taps.gains_differ or np.ptp(taps.gain) < DIFFER:
         return
@@ -24,6 +32,33 @@ def gains_differ(result: FitResult) -> Iterator[str]:
         f" (± {float(taps.gain_error.mean()):.1g}). Gain, read noise and dark current here are of all of them together;"
         f" {alone} fits the first output alone."
     )
+
+
+def _of_greens(found: Survey) -> Iterator[str]:
+    """That the two pixels of a channel in each cell grow unlike: they are alike, so that their gains differ."""
+    if not found.has_exposures:
+        return
+    longest = max(found.repeated_darks, key=lambda group: group.exposure_s)
+    for c, name in enumerate(found.channels):
+        pairs = [*zip(found.shortest.of(c), longest.of(c), strict=True)]
+        if len(pairs) != 2:
+            continue
+        (one, one_error), (other, other_error) = (_growth(*pair) for pair in pairs)
+        if min(one, other) <= 0:
+            continue
+        ratio, error = one / other, np.hypot(one_error / one, other_error / other)
+        if abs(ratio - 1) > max(DIFFER, SIGMAS * error):
+            yield (
+                f"In even rows the pixels of channel {name} gather {ratio:.3f} ± {ratio * error:.2g} times the dark"
+                f" signal, in DN, of those in odd rows: their gains differ, and gain.{name} is of both together."
+            )
+
+
+def _growth(short: Plane, long: Plane) -> tuple[float, float]:
+    """Of the level of the typical pixel between two exposures, DN, and its standard error by how pixels differ."""
+    grown = long.halves.level_dn.mean(0) - short.halves.level_dn.mean(0)
+    typical = float(np.median(grown))
+    return typical, 1.2533 * 1.4826 * float(np.median(np.abs(grown - typical))) / np.sqrt(len(grown))
 
 
 def outputs(result: FitResult) -> Iterator[str]:

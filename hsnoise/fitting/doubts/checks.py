@@ -22,7 +22,7 @@ from hsnoise.fitting.doubts._few import few_frames, single_frames
 from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._stated import header_gain, stated
-from hsnoise.fitting.doubts._taps import columns_in_light, gains_differ, outputs
+from hsnoise.fitting.doubts._taps import columns_in_light, gains_differ, outputs, outputs_differ
 from hsnoise.fitting.flat_notes import flat_doubts, gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
@@ -84,7 +84,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *_many_hot(result),
         *few_frames(result, found),
         *curves(result),
-        *gains_differ(result),
+        *gains_differ(result, found),
         *flat_doubts(result),
     )
     doubts = tuple(dict.fromkeys([*odd, *open_gain, *grave, *minor]))  # first what makes all others pointless
@@ -190,7 +190,7 @@ def _coupled(shared: tuple[float, float]) -> Iterator[str]:
 def _moved_pedestals(result: FitResult) -> Iterator[str]:
     """Pedestals that moved; the gain then does not depend on them."""
     pixel = result.transfer
-    if "black_clamp" in result.params or any(gains_differ(result)):  # outputs of other gains look like a pedestal
+    if "black_clamp" in result.params or any(outputs_differ(result)):  # outputs of other gains look like a pedestal
         return
     for channel in pixel.channels if pixel is not None and pixel.flats is None and result.has_gain else ():
         t, of = channel.transfer, "" if channel.name == "mono" else f" of {channel.name}"
