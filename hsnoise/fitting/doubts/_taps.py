@@ -41,8 +41,8 @@ def _of_greens(found: Survey) -> Iterator[str]:
     longest = max(found.repeated_darks, key=lambda group: group.exposure_s)
     for c, name in enumerate(found.channels):
         pairs = [*zip(found.shortest.of(c), longest.of(c), strict=True)]
-        if len(pairs) != 2:
-            continue
+        if len(pairs) != 2 or any(plane.narrow_dn is not None for pair in pairs for plane in pair):
+            continue  # one a cell; or rounding bends the levels
         (one, one_error), (other, other_error) = (_growth(*pair) for pair in pairs)
         if min(one, other) <= 0:
             continue
