@@ -22,6 +22,11 @@ MOST_PART = 2**32 - 1  # above and below the line of a rational number in a tag
 SAME_EXPOSURE = 1e-3  # exposures that differ by less count as the same when they are read
 
 
+def is_one_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to the same file that is there: to write one would lose the other."""
+    return one.exists() and other.exists() and one.samefile(other)
+
+
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:
     """Write a file so that a reader finds either the old or the new content, never half of it.
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsnoise._core.folders import sweep
+from hsnoise._core.output import is_one_file
 from hsnoise._core.types import channels_of
 from hsnoise.chain.photometry import GREY, frames_of_display, light_of_frames
 from hsnoise.effects import BlackLevel
@@ -74,7 +75,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"OUT: expected a video file, ending in {', '.join(WRITTEN)}, got {args.out}")
     if not args.out.parent.is_dir():
         raise ValueError(f"OUT: there is no folder {args.out.parent}")
-    if args.out.exists() and Path(args.video).exists() and args.out.samefile(args.video):
+    if is_one_file(args.out, Path(args.video)):
         raise ValueError(f"OUT: expected another file than IN, got {args.out}, which would be lost")
     for option, (low, high) in RANGES.items():
         value = getattr(args, option)

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hsnoise._core.folders import sweep
-from hsnoise._core.output import FRAME_FORMATS, frames_file, read_image, write_atomically
+from hsnoise._core.output import FRAME_FORMATS, frames_file, is_one_file, read_image, write_atomically
 from hsnoise._core.types import cfa_tile
 from hsnoise.chain.model_file import read_model
 from hsnoise.chain.photometry import scale_to_photoelectrons
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--shape: goes with dark frames; those of --clean have the shape of the image")
     if args.out.is_dir():
         raise ValueError(f"--out: expected a file, but {args.out} is a folder")
-    if args.clean is not None and Path(args.clean).exists() and args.out.exists() and args.out.samefile(args.clean):
+    if args.clean is not None and is_one_file(args.out, Path(args.clean)):
         raise ValueError(f"--out: {args.out} is the image of --clean, which would be lost")
     model = model_of(args.model, "MODEL")
     exposures_s = args.exposure or [model.exposure_s]

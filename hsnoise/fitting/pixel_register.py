@@ -132,7 +132,7 @@ def _electrons(found: Survey, step: Number) -> tuple[list[tuple[float, Number]],
 
 def _cool(found: Survey) -> np.ndarray:
     """Pixels that are not among the hottest of the longest exposure, by each half of its frames [half, pixel]."""
-    hottest = max(found.repeated_darks, key=lambda one: one.exposure_s).pixels(0, "level_dn")
+    hottest = found.longest.pixels(0, "level_dn")
     return hottest <= np.quantile(hottest, 1 - LEFT_OUT, axis=1, keepdims=True)
 
 
@@ -151,7 +151,7 @@ def _excess_of(step: Number, flats: FlatGain) -> Number:
 
 def _pixels(found: Survey, step: float, noise: float, clocks: float, rate: float) -> Pixels:
     """How pixels differ at the longest exposure that shows it, from halves of its frames, whose chance is their own."""
-    longest = max(found.repeated_darks, key=lambda group: group.exposure_s)
+    longest = found.longest
     frames, t = longest.n_frames, longest.exposure_s
     halves = longest.pixels(0, "level_dn").astype(np.float64)
     mean = clocks + rate * t

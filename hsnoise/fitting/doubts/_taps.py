@@ -38,9 +38,8 @@ def _of_greens(found: Survey) -> Iterator[str]:
     """That the two pixels of a channel in each cell grow unlike: they are alike, so that their gains differ."""
     if not found.has_exposures:
         return
-    longest = max(found.repeated_darks, key=lambda group: group.exposure_s)
     for c, name in enumerate(found.channels):
-        pairs = [*zip(found.shortest.of(c), longest.of(c), strict=True)]
+        pairs = [*zip(found.shortest.of(c), found.longest.of(c), strict=True)]
         if len(pairs) != 2 or any(plane.narrow_dn is not None for pair in pairs for plane in pair):
             continue  # one a cell; or rounding bends the levels
         (one, one_error), (other, other_error) = (_growth(*pair) for pair in pairs)

@@ -82,8 +82,8 @@ def _below(root: Path) -> tuple[list[Path], list[str]]:
         found += [Path(folder) / name for name in names if not name.startswith(".")]
     known = [path for path in found if reader_name(path)]
     chosen = [path for path in known if path.is_file()]
-    lost = [path.relative_to(root) for path in known if not path.is_file()]
-    told += [f"{path} was set aside: a link to nothing, or no file" for path in lost]
+    lost = sorted(set(known).difference(chosen))
+    told += [f"{path.relative_to(root)} was set aside: a link to nothing, or no file" for path in lost]
     return sorted(chosen, key=lambda path: [in_order(Path(part)) for part in path.relative_to(root).parts]), told
 
 

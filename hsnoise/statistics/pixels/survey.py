@@ -201,6 +201,11 @@ class Survey:
         """The shortest of `repeated_darks`; None without any."""
         return min(self.repeated_darks, key=lambda group: group.exposure_s, default=None)
 
+    @property
+    def longest(self) -> Group | None:
+        """The longest of `repeated_darks`; None without any."""
+        return max(self.repeated_darks, key=lambda group: group.exposure_s, default=None)
+
 
 def survey(stack: FrameStack, tick: Callable[[], object] = lambda: None) -> Survey:
     """Read every frame of `stack` once; `tick` is called after each.
