@@ -39,7 +39,7 @@ from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
 from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
-from hsnoise.statistics.pixels.classes import Levels, hot_from, kept_of, levels_of, slope_over
+from hsnoise.statistics.pixels.classes import Levels, hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.comb import Comb
 from hsnoise.statistics.pixels.glow import Glow, glow_of, glow_of_pixels, without_glow
 from hsnoise.statistics.pixels.hits import Rays, rays_of
@@ -190,7 +190,7 @@ def _channel(
     tail = tail_of(found, c) if is_plain and jumps is None else None
     raised = 1.0 if jumps is None else _raised_by(jumps, found.shortest.n_frames)
     floor, floor_error = _temporal(found, c, raised) if narrow is None else variance_of(narrow)
-    pixels = levels_of(found, c, without=jumping) if register is None else None
+    pixels = levels_of(found, c, jumping) if register is None else None
     spectrum = row_spectrum(shortest_of(found, c), found.shape[0], partial(known_of_rows, found, c))
     of_columns = column_spectrum(shortest_of(found, c), found.shape[1], known_of_columns(found, c))
     banding = banding_in(found, c)
@@ -207,8 +207,8 @@ def _channel(
         transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
     if transfer is not None and pixels is not None:
         glow = glow_of(found, c)
-        of_glow = None if glow is None else glow_of_pixels(glow, found, c)[kept_of(found, c, jumping)]
-        population = _population(found, c, pixels, transfer, of_glow)
+        of_glow = None if glow is None else glow_of_pixels(glow, found, c)[~found.stuck(c)][~pixels.noisy.all(0)]
+        population = _population(found, c, pixels.calm(), transfer, of_glow)
         values, covariance = _transferred(transfer, at_rest, population, (jumps, raised), tail)
     if found.code_step > 1:
         coarse = ROUNDING * (found.code_step**2 - 1)
@@ -225,7 +225,7 @@ def _channel(
     offset = offset_of(found, c, population)
     warm = _warm(found, c) if is_plain and not found.has_exposures else None
     if pixels is not None:
-        black = black_of_pixels(pixels), black[1]
+        black = black_of_pixels(pixels.calm()), black[1]
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
     if is_unlit(found, max(growth, values[2])) and (population is None or population.hot_fraction[0] <= 0):
         black = mean_black(found, c, warm, jumps), black[1]

@@ -63,7 +63,10 @@ class Classes:
 
 
 class Levels(NamedTuple):
-    """Every sampled pixel of a channel in the dark exposures; see `Halves`. [exposure, half, pixel], [exposure]."""
+    """Every sampled pixel of a channel in the dark exposures; see `Halves`. [exposure, half, pixel], [exposure].
+
+    noisy [half, pixel]: which look in half of the frames as if they jumped.
+    """
 
     exposure_s: np.ndarray
     level: np.ndarray
@@ -72,18 +75,27 @@ class Levels(NamedTuple):
     whole_variance: np.ndarray
     n_frames: np.ndarray
     pedestal_sigma_dn: np.ndarray
+    noisy: np.ndarray
+
+    def calm(self) -> Levels:
+        """Of the pixels that do not look noisy in both halves."""
+        kept = ~self.noisy.all(0)
+        if kept.all():
+            return self
+        of_pixels = (of[..., kept] for of in (self.level, self.variance, self.peak, self.whole_variance))
+        return Levels(self.exposure_s, *of_pixels, self.n_frames, self.pedestal_sigma_dn, self.noisy[:, kept])
 
 
-def levels_of(found: Survey, channel: int, without: np.ndarray | None = None) -> Levels | None:
+def levels_of(found: Survey, channel: int, noisy: np.ndarray | None = None) -> Levels | None:
     """The sampled pixels of one channel that are not stuck; None without two dark exposures of two frames.
 
-    without: others that are left out [pixel].
+    noisy: which look in half of the frames as if they jumped [half, pixel].
     """
     groups = found.repeated_darks
     t = np.array([g.exposure_s for g in groups])
     if len(groups) < 2 or np.ptp(t) == 0:
         return None
-    moving = kept_of(found, channel, without)
+    moving = ~found.stuck(channel)
     if moving.sum() < FEWEST_ALIVE:
         return None
     level, variance, peak, whole = (
@@ -92,13 +104,8 @@ def levels_of(found: Survey, channel: int, without: np.ndarray | None = None) ->
     )
     sigma = _pedestal_sigmas([np.mean([p.halves.frame_means_dn for p in g.of(channel)], axis=0) for g in groups])
     sigma = _off_the_line(t, np.median(level, axis=(1, 2)), sigma)
-    return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma)
-
-
-def kept_of(found: Survey, channel: int, without: np.ndarray | None = None) -> np.ndarray:
-    """Which sampled pixels `levels_of` keeps [pixel]."""
-    moving = ~found.stuck(channel)
-    return moving if without is None else moving & ~without
+    noisy = np.zeros((2, int(moving.sum())), bool) if noisy is None else noisy[:, moving]
+    return Levels(t, level, variance, peak, whole, np.array([g.n_frames for g in groups]), sigma, noisy)
 
 
 def is_hot(found: Survey, channel: int) -> np.ndarray:
@@ -138,7 +145,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
         peak = np.sqrt(np.maximum(pixels.whole_variance, 0) * (pixels.n_frames[:, None] - 1))
         peak = np.where(few, peak, pixels.peak.max(1))
         members = _members(mean, _edges(mean, limit, False))
-        whole = _Half(pixels.level.mean(1), pixels.whole_variance, peak)
+        whole = _Half(pixels.level.mean(1), pixels.whole_variance, peak, pixels.noisy.all(0))
         parts = [_measured(members, whole, whole, t, pixels.n_frames - 1, full_scale_dn)]
         grown = [mean]
     level, variance, error, count, apart = (np.concatenate(x) for x in zip(*[p[:-1] for p in parts], strict=True))
@@ -150,7 +157,7 @@ def classes_of(pixels: Levels, full_scale_dn: float) -> Classes:
 def _half(pixels: Levels, half: int) -> _Half:
     frames = (pixels.n_frames + 1 - half) // 2
     own = np.sqrt(1 - 1 / np.maximum(frames, 2))[:, None].astype(pixels.peak.dtype)
-    return _Half(pixels.level[:, half], pixels.variance[:, half], pixels.peak[:, half] / own)
+    return _Half(pixels.level[:, half], pixels.variance[:, half], pixels.peak[:, half] / own, pixels.noisy[half])
 
 
 def least_hit(sigma_dn: np.ndarray, n_frames: np.ndarray) -> np.ndarray:
@@ -247,11 +254,13 @@ class _Half(NamedTuple):
     """Every pixel in half of the frames, [exposure, pixel]; see `Halves`.
 
     peak: largest deviation from the mean, in units of the deviation that it has of the mean of so few frames.
+    noisy [pixel]: whether it looks as if it jumped.
     """
 
     level: np.ndarray
     variance: np.ndarray
     peak: np.ndarray
+    noisy: np.ndarray
 
 
 def _measured(members: list[np.ndarray], found: _Half, other: _Half, t: np.ndarray, dof, full_scale_dn: float):
@@ -267,7 +276,9 @@ def _measured(members: list[np.ndarray], found: _Half, other: _Half, t: np.ndarr
     scatter, exposures = _level_scatter(members, level, other.level, t), range(len(level))
     for c, inside in enumerate(members):
         bright = (other.level[:, inside] - ordinary[:, None]).astype(np.float64)
-        kept, outliers = _calm(_Half(*(of[:, inside] for of in found)), _Half(*(of[:, inside] for of in other)), bright)
+        kept, outliers = _calm(
+            _Half(*(of[..., inside] for of in found)), _Half(*(of[..., inside] for of in other)), bright
+        )
         apart[c] = outliers.sum(1)
         for e in exposures:
             v, y = variance[e, inside].astype(np.float64), level[e, inside].astype(np.float64)
@@ -298,8 +309,9 @@ def _calm(found: _Half, other: _Half, bright: np.ndarray) -> tuple[np.ndarray, n
     """
     limit = OUTLIER_SIGMAS * np.stack([_expected_scale(v, of) for v, of in zip(found.variance, bright, strict=True)])
     own = np.sqrt(np.maximum(np.nan_to_num(other.variance), 0))  # NaN of single frames
-    kept = (other.peak < limit) & (found.peak < np.maximum(limit, OUTLIER_SIGMAS * own))
-    return kept.all(0), found.peak >= limit
+    apart = found.peak >= np.maximum(limit, OUTLIER_SIGMAS * own)
+    kept = (other.peak < limit) & ~apart
+    return kept.all(0) & ~other.noisy, apart
 
 
 def _chance_error(variance: np.ndarray, excess: np.ndarray, floor: float, dof: int) -> float:

@@ -15,6 +15,8 @@ LIT_SIGMAS = 5.0  # a signal below this, in units of a level's noise, is no ligh
 FEWEST = 20  # pixels of a class
 RARE = 1e-3  # chance of a variance that high, in each half of the frames
 NOISIER = 2.0  # times the variance of others of its level, at least: many frames show any small difference
+SPREADS = 3.0  # of the logarithm of the variance over pixels, beyond chance: read noise differs, as log-normal numbers
+ONE_BELOW = 0.1587  # of normal numbers lie a standard deviation below the mean
 
 
 def flags_of(found: Survey, channel: int) -> np.ndarray:
@@ -76,10 +78,24 @@ def _jumping(groups: tuple[Group, ...], channel: int, pixels: int) -> np.ndarray
         if dof.min() < 1:
             continue
         level = group.pixels(channel, "level_dn").mean(0)
-        expected = _of_their_level(level, group.pixels(channel, "pair_variance_dn2"))
-        limit = np.maximum(chi2.isf(RARE, dof) / dof, NOISIER)
-        found |= (group.pixels(channel, "variance_dn2") / np.maximum(expected, 0.25) > limit[:, None]).all(0)
+        variance = group.pixels(channel, "pair_variance_dn2")
+        expected = np.maximum(_of_their_level(level, variance), 0.25)
+        spread = _spread_below(variance / expected, group.n_frames - 1)
+        limit = np.maximum(chi2.isf(RARE, dof) / dof * np.exp(SPREADS * spread), NOISIER)
+        found |= (group.pixels(channel, "variance_dn2") / expected > limit[:, None]).all(0)
     return found
+
+
+def _spread_below(variance: np.ndarray, dof: int) -> float:
+    """Standard deviation over pixels of the logarithm of their true variance, from the quieter half of the pixels.
+
+    Jumps make pixels noisier, never quieter. variance [pixel]: measured, with so many degrees of freedom each.
+    """
+    low, middle = np.quantile(variance, (ONE_BELOW, 0.5))
+    if low <= 0:
+        return 0.0
+    chance = np.log(chi2.median(dof) / chi2.ppf(ONE_BELOW, dof))
+    return float(np.sqrt(max(np.log(middle / low) ** 2 - chance**2, 0.0)))
 
 
 def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ class Jumps(NamedTuple):
     exponential: whether amplitudes are exponential over pixels (a spread of 1), or all alike (0); between the two,
     only the product of fraction and amplitude would show. noise_spread: standard deviation of the logarithm of the
     noise over pixels. noise_dn2: variance of an ordinary pixel, rounding included. cut: mean variance of all ordinary
-    pixels over that of those that pass for ordinary, as the noisiest look as if they jumped.
+    pixels over that of those that do not look in half of the frames as if they jumped.
     """
 
     fraction: Number
@@ -89,7 +89,11 @@ class Moments(NamedTuple):
 
     def is_noisy(self, limits: np.ndarray) -> np.ndarray:
         """Which pixels are noisier than others in both halves of the frames, and in all: `limits` of the three."""
-        return (self.halves > limits[:2, None]).all(0) & (self.variance > limits[2])
+        return self.look_noisy(limits).all(0) & (self.variance > limits[2])
+
+    def look_noisy(self, limits: np.ndarray) -> np.ndarray:
+        """Which pixels are noisier than most in each half of the frames [half, pixel]."""
+        return self.halves > limits[:2, None]
 
     def noisy(self, limits: np.ndarray) -> Moments:
         """The noisy ones."""
@@ -98,7 +102,7 @@ class Moments(NamedTuple):
 
     def by_chance(self, limits: np.ndarray) -> float:
         """How many would be noisy in both halves if one did not tell of the other."""
-        return float(np.prod((self.halves > limits[:2, None]).sum(1))) / len(self.variance)
+        return float(np.prod(self.look_noisy(limits).sum(1))) / len(self.variance)
 
     def in_bins(self, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """By bin of the variance: number of pixels, mean shapes [bin, shape], and their errors (1e6 of too few)."""
@@ -185,7 +189,8 @@ class Search:
     limits: np.ndarray
     noise_dn2: float
     chance: Chance
-    normal: np.ndarray  # shapes of normal noise [bin, shape]
+    normal: np.ndarray  # shapes of normal noise [bin, shape], and their errors: they are drawn, too
+    normal_errors: np.ndarray
     ordinary: Callable[[float], Bins]  # of pixels that do not jump, by the spread of their noise
 
     @classmethod
@@ -197,13 +202,14 @@ class Search:
         chance = Chance.of(frames)
         # Given its variance, the shape of normal noise does not depend on its strength.
         of_normal = _over_time(chance, noise_dn2, np.exp(chance.depth / 2), None)
-        normal = Bins.of(of_normal, limits, edges).shapes
+        normal = Bins.of(of_normal, limits, edges)
 
         @lru_cache(maxsize=8)
         def ordinary(spread: float) -> Bins:
             return Bins.of(chance.of_ordinary(spread)[1], limits, edges)
 
-        return cls(Bins.of(pixels, limits, edges), edges, limits, noise_dn2, chance, normal, ordinary)
+        measured, shapes = Bins.of(pixels, limits, edges), (normal.shapes, normal.shape_errors)
+        return cls(measured, edges, limits, noise_dn2, chance, *shapes, ordinary)
 
     def drawn(self, of: Jumps) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Shares and shapes of jumping and ordinary pixels whose noise differs, and their errors by chance."""
@@ -232,7 +238,7 @@ class Search:
 
     def misfit_of_normal(self) -> float:
         """Chi-square of the shapes of normal noise, of any strength."""
-        return float(np.sum(self._shapes_off(self.normal, np.zeros_like(self.normal)) ** 2))
+        return float(np.sum(self._shapes_off(self.normal, self.normal_errors) ** 2))
 
     def best(self) -> tuple[Jumps, float]:
         """The nearest jumps, with the errors of least squares (larger where they do not describe the pixels), and the
@@ -250,7 +256,7 @@ class Search:
 
     def _cut(self, of: Jumps) -> float:
         noise, pixels = self.chance.of_ordinary(of.noise_spread[0])
-        return float(noise.mean() / noise[~pixels.is_noisy(self.limits)].mean())
+        return float(noise.mean() / noise[~pixels.look_noisy(self.limits)[0]].mean())
 
     def _nearest(self, kind: tuple[bool, bool], start: np.ndarray, tries: int):
         """The kind, and the end of a search."""

@@ -24,12 +24,12 @@ FAILS, FAR_BETTER = 2.0, 0.5  # chi-square of normal noise per degree of freedom
 
 
 def jumps_of(found: Survey, channel: int) -> tuple[Jumps | None, np.ndarray]:
-    """The jumping pixels of a channel, in DN, and which sampled pixels are seen to jump [pixel].
+    """The jumping pixels of a channel, in DN, and which pixels look so in each half of the frames [half, pixel].
 
     None if there are few, or they may be noisier without jumping. Hot pixels, which have shot noise, do not count.
     """
     kept = ~(found.stuck(channel) | is_hot(found, channel))
-    groups, jumping = _alike(found.repeated_darks, channel, kept), np.zeros(len(kept), bool)
+    groups, jumping = _alike(found.repeated_darks, channel, kept), np.zeros((2, len(kept)), bool)
     frames = [group.n_frames for group in groups]
     if sum(frames) < FEWEST_FRAMES:
         return None, jumping
@@ -42,7 +42,8 @@ def jumps_of(found: Survey, channel: int) -> tuple[Jumps | None, np.ndarray]:
         return None, jumping
     typical = float(np.mean([_typical(group, channel, kept) for group in groups]))
     best = _best(pixels, limits, frames, typical)
-    jumping[kept] = is_noisy & (best is not None)
+    if best is not None:
+        jumping[:, kept] = pixels.look_noisy(limits)
     return best, jumping
 
 
