@@ -162,6 +162,11 @@ class Reader:
         if program == "make":  # installs an environment: tests/test_package.py does that
             words = [word for word in words if "=" not in word]
             return subprocess.run(["make", "-n", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        if program == "python":  # benchmarks take long: their options are looked up
+            helped = subprocess.run([sys.executable, *words[:2], "--help"], cwd=ROOT, capture_output=True, text=True)
+            unknown = [word for word in words if word.startswith("--") and word not in helped.stdout]
+            assert helped.returncode == 0 and not unknown, (line, unknown)
+            return helped.stdout
         assert program == "hsnoise", f"no such command is run here: {line}"
         self.capsys.readouterr()
         status = main([*words, *IN_LITTLE.get(words[0], [])])
@@ -203,6 +208,16 @@ RUNS = [
 ]
 
 
+@pytest.fixture
+def code_of_users():
+    """Effects of users may broadcast as NumPy does; the tests of ours may not."""
+    strict = jax.config.jax_numpy_rank_promotion
+    jax.config.update("jax_numpy_rank_promotion", "allow")
+    yield
+    jax.config.update("jax_numpy_rank_promotion", strict)
+
+
+@pytest.mark.usefixtures("code_of_users")
 @pytest.mark.parametrize(("page", "library"), RUNS)
 def test_page_runs(page, library, folder, request, monkeypatch, capsys):
     if library == "few":
@@ -218,9 +233,8 @@ def test_page_runs(page, library, folder, request, monkeypatch, capsys):
 
 
 def _own_effect(page) -> None:
-    assert page.without.verdict != "named"
-    assert page.found.best.name == page.found.ranking[0].name == "breathing_dark"
-    assert 0.05 < page.found.best.effect.swing < 0.2  # a first estimate of 0.1
+    assert page.found.best.name == page.found.ranking[0].name == "chessboard"
+    assert 0.5 < page.found.best.effect.offset < 2  # a first estimate of 1
 
 
 def _sampling(page) -> None:
@@ -234,8 +248,8 @@ def _enhancer(page) -> None:
 
 
 def _first_hour(page) -> None:
-    name = "flats, static pixels"  # where the effect shows that the reader adds
-    assert page.after.groups[name] < page.report.groups[name] / 10
+    name = "flats, static pixels"  # where the effects show that the fit adds
+    assert page.report.groups[name] < page.paper.groups[name] / 10
 
 
 CHECKS = {"add-an-effect": _own_effect, "sampling": _sampling, "enhancer": _enhancer, "first-hour": _first_hour}

@@ -2,9 +2,9 @@
 
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
 headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
-`_taps`: outputs with gains of their own. `_few`: what two or three frames leave open. `_choice`: which of two fits to
-believe. Here: a gain without growth of signal to support it, frames and pixels that measure nothing, and the order of
-all checks.
+`_taps`: outputs with gains of their own. `_shared`: noise that is not a pixel's own. `_few`: what two or three frames
+leave open. `_waiting`: dark signal without exposure. `_choice`: which of two fits to believe. Here: a gain without
+growth of signal to support it, frames and pixels that measure nothing, and the order of all checks.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._few import few_frames, single_frames
 from hsnoise.fitting.doubts._lines import curves, defects
 from hsnoise.fitting.doubts._register import of_register
+from hsnoise.fitting.doubts._shared import shared_noise
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.doubts._taps import columns_in_light, gains_differ, outputs, outputs_differ
+from hsnoise.fitting.doubts._waiting import waiting
 from hsnoise.fitting.flat_notes import flat_doubts, gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
-from hsnoise.statistics.pixels.along_rows import of_the_signal
-from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart, smoothed
+from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
@@ -42,7 +43,6 @@ OFF_LINE = 3.0  # chi2 per degree of freedom
 MANY_OUTLIERS, MOST_OUTLIERS = 3e-3, 0.05  # share of pixels that is reported; above which a fit is not trusted
 CLIPPED_SHARE, NOISE_SPREAD = 1e-3, 0.2  # share of counts; of a pixel's temporal variance, relative deviation
 MOST_CLIPPED = 0.02  # share of counts: where it is cut so near, the noise comes out 2 % too small
-COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
 LONG_S = 0.5  # of the only dark exposure, from which its dark signal may show
 LEAST_STEPS = 0.8  # of a step of the codes: with less noise rounding is no noise of its own
 MANY_HOT = 0.15  # share of pixels
@@ -58,12 +58,9 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
     grave = [sentence for check in checks for sentence in check(result, found)]
     odd = oddities_of(found)
     grave += [*stated(result, seen), *odd]
-    moved, shared = tuple(moved_frames(found)), of_the_signal(found.along)
+    moved, (much, little) = tuple(moved_frames(found)), shared_noise(result, found)
     grave += moved if result.transfer is None else ()
-    grave += () if result.transfer is not None and result.transfer.ringing is not None else smoothed(found)
-    spread = result.transfer is not None and any(one.bend.spreads for one in result.transfer.channels)
-    of_signal = () if spread else tuple(_coupled(shared))
-    grave += of_signal if abs(2 * sum(shared)) > MOST_COUPLED else ()
+    grave += much
     share = _outlier_share(result)
     alone = tuple(_by_shape_alone(result))
     grave += alone if is_extraordinary(result) else ()
@@ -76,7 +73,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *header_gain(result),
         *order_note(result),
         *pixels_apart(found, _has_noisy_pixels(result)),
-        *of_signal,
+        *little,
         *lit_darks(found),
         *moved,
         *_outliers(result),
@@ -98,6 +95,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
             *columns_in_light(result),
             *_of_codes(found),
             *_of_neighbours(result),
+            *waiting(result, found),
             *_of_narrow(result, found),
             *_of_flats(result),
         )
@@ -137,12 +135,20 @@ def _withheld(result: FitResult, found: Survey) -> Iterator[str]:
         )
     elif not found.has_exposures:
         why = "darks of one exposure show no growth of signal"
+    elif _grows(pixel, read_dn):
+        why = "the noise of ordinary pixels does not grow with their dark signal as shot noise does"
     else:
         why = "the dark signal of ordinary pixels does not grow enough with exposure"
     yield (
         f"The gain is not determined: {why}. {_named_noise(found)} is {read_dn:.4g} ±"
         f" {error / max(2 * read_dn, 1e-9):.2g} DN. {ADD}"
     )
+
+
+def _grows(pixel: PixelFit, read_dn: float) -> bool:
+    """Whether the dark signal of ordinary pixels exceeds the noise without signal."""
+    told = [t for c in pixel.channels if (t := c.transfer) is not None]
+    return any(np.median(np.ptp(t.classes.level_dn[~t.classes.hot], axis=1)) > read_dn for t in told)
 
 
 def _named_noise(found: Survey) -> str:
@@ -170,21 +176,6 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
             )
     if pixel.flats is not None:
         yield from _flats_against_darks(pixel)
-
-
-def _coupled(shared: tuple[float, float]) -> Iterator[str]:
-    """Shot noise that neighbours share: a pixel's variance is then no measure of its electrons.
-
-    shared: correlation along rows and down columns. What two share is missing in the variance of both.
-    """
-    (along, down), less = shared, 2 * sum(shared)
-    if abs(less) > COUPLED:
-        above = f", those above each other {down:+.1%}," if down else ""
-        yield (
-            f"Neighbours along a row share {along:+.1%}{above} of their shot noise: the signal is coupled (hsnoise"
-            f" diagnose may name it), and the gain comes out too {'small' if less > 0 else 'large'} by up to"
-            f" {abs(less):.0%}."
-        )
 
 
 def _moved_pedestals(result: FitResult) -> Iterator[str]:

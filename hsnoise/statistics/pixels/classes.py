@@ -82,8 +82,8 @@ class Levels(NamedTuple):
         kept = ~self.noisy.all(0)
         if kept.all():
             return self
-        of_pixels = (of[..., kept] for of in (self.level, self.variance, self.peak, self.whole_variance))
-        return Levels(self.exposure_s, *of_pixels, self.n_frames, self.pedestal_sigma_dn, self.noisy[:, kept])
+        names = "level", "variance", "peak", "whole_variance", "noisy"
+        return self._replace(**{name: getattr(self, name)[..., kept] for name in names})
 
 
 def levels_of(found: Survey, channel: int, noisy: np.ndarray | None = None) -> Levels | None:

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from hsnoise.statistics.apart import typical_offset
 from hsnoise.statistics.pixels.hits import Hits, hits_of
+from hsnoise.statistics.pixels.memory import Memory, memory_of
 
 MOST_PIXELS = 1 << 21  # sampled pixels of an exposure
 MOST_OF_ALL = 1 << 22  # of all exposures together
@@ -48,6 +49,7 @@ class Halves:
         rows_dn2: variance of rows over frames beside that of their pixels, outliers cut, DN^2.
         frame_noise_dn [frame]: spread over pixels of what changes in a frame, DN, outliers left out.
         hits: pixels far above their level in one frame; None of too few frames.
+        memory: what pixels keep of the frame before; None of too few frames.
     """
 
     n_frames: tuple[int, int]
@@ -63,6 +65,7 @@ class Halves:
     rows_dn2: float
     frame_noise_dn: np.ndarray
     hits: Hits | None
+    memory: Memory | None
 
 
 def covariance_of(a: np.ndarray, b: np.ndarray) -> float:
@@ -106,8 +109,8 @@ def halves_of(counts: np.ndarray) -> Halves:
     third, fourth = _higher(flat)
     noise = np.array([_core_spread((frame - values.mean(0)).ravel()) for frame in values]) * np.sqrt(n / (n - 1))
     frames = len(flat[::2]), len(flat[1::2])
-    moments, rows_dn2 = (whole, third, fourth), n * of_lines[0]
-    return Halves(frames, level, variance, peak, lowest, highest, frame_means, *moments, rows_dn2, noise, hits_of(flat))
+    told = frame_means, whole, third, fourth, n * of_lines[0], noise
+    return Halves(frames, level, variance, peak, lowest, highest, *told, hits_of(flat), memory_of(flat))
 
 
 def _higher(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

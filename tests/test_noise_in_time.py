@@ -1,0 +1,66 @@
+"""What pixels keep of the frame before, and dark signal that flows without exposure, are told; wandering is neither."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hsnoise
+
+SHAPE, FRAMES, GAIN, READ_E = (120, 160), 10, 2.0, 4.0
+EXPOSURE_S = (0.01, 0.3, 1.0, 3.0)
+
+
+def electrons(rng, exposure_s: float, rate: np.ndarray, waiting_s: float = 0.0) -> np.ndarray:
+    """Of each pixel in each frame [frame, row, column], read noise included."""
+    shot = rng.poisson(np.broadcast_to(rate * (exposure_s + waiting_s), (FRAMES, *SHAPE)))
+    return shot + READ_E * rng.standard_normal(shot.shape)
+
+
+def fit(change=lambda rng, e: e, waiting_s: float = 0.0) -> hsnoise.FitResult:
+    rng = np.random.default_rng(4)
+    rate, offset = 40 * rng.lognormal(-0.08, 0.4, SHAPE), rng.normal(0, 1.0, SHAPE)
+    of = [change(rng, electrons(rng, t, rate, waiting_s)) for t in EXPOSURE_S]
+    counts = [np.clip(np.rint(200 + offset + GAIN * e), 0, 65535).astype(np.uint16) for e in of]
+    return hsnoise.fit(hsnoise.FrameStack(counts, EXPOSURE_S, white_level=65535, shutter="global"))
+
+
+def filtered(share: float):
+    def change(rng, e):
+        out = e.copy()
+        for f in range(1, len(e)):
+            out[f] = (1 - share) * e[f] + share * out[f - 1]
+        return out
+
+    return change
+
+
+def drifting(rng, e):
+    """Offsets of pixels that drift by a fifth of the noise in each frame."""
+    return e + 0.2 * READ_E * rng.standard_normal(SHAPE) * np.arange(len(e))[:, None, None]
+
+
+def wandering(rng, e):
+    return e + np.cumsum(0.2 * READ_E * rng.standard_normal(e.shape), axis=0)
+
+
+def of_frames_and_rows(rng, e):
+    return e + 3 * rng.standard_normal((len(e), 1, 1)) + rng.standard_normal((len(e), SHAPE[0], 1))
+
+
+@pytest.mark.parametrize(("share", "light"), [(0.02, "amber"), (0.1, "red")])
+def test_a_filter_over_frames_is_told(share, light):
+    found = fit(filtered(share))
+    assert str(found.conclusion.light) == light
+    assert any("frame before" in doubt for doubt in found.doubts), found.doubts
+
+
+@pytest.mark.parametrize("change", [lambda rng, e: e, drifting, wandering, of_frames_and_rows])
+def test_nothing_else_is_taken_for_it(change):
+    assert not any("frame before" in doubt for doubt in fit(change).doubts)
+
+
+def test_dark_signal_without_exposure_is_told():
+    told = [note for note in fit(waiting_s=0.2).notes if "longer" in note]
+    assert told and "lasted 0.2 s longer" in told[0]
+    assert not any("longer:" in note for note in fit().notes)
