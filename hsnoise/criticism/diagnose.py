@@ -112,15 +112,18 @@ def diagnosed(
 def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -> Diagnosis:
     """What draws of the model show. What they show weakly, where the model fits, is judged by twice as many.
 
-    From 64 draws, neither how statistics scatter together nor the limit of chance is known well.
+    From 64 draws, neither how statistics scatter together nor the limit of chance is known well. Where the fit measured
+    pixels, lines and frames one by one, a weak finding is none: such captures are never quite the model's, so that
+    scores of its draws are no limit, and what they hold beyond would show in a statistic.
     """
     found, evidence = _by_draws(fit, portion, candidates, draws, key_of("seed", seed), tick)
     if found.best is None or evidence.misfit(evidence.null) > rules.MISFIT or found.best.score > rules.MARKOV_UP_TO:
         return found
-    again, other = _by_draws(fit, portion, candidates, draws, named_key(key_of("seed", seed), "again"), tick)
-    score = found.best.score + next((one.score for one in again.ranking if one.name == found.best.name), 0.0)
-    if score > evidence.limit + other.limit:
-        return found
+    if not isinstance(fit, FitResult) or fit.transfer is None:
+        again, other = _by_draws(fit, portion, candidates, draws, named_key(key_of("seed", seed), "again"), tick)
+        score = found.best.score + next((one.score for one in again.ranking if one.name == found.best.name), 0.0)
+        if score > evidence.limit + other.limit:
+            return found
     left = what_remains(evidence, evidence.null)
     return replace(found, verdict=Verdict.NOTHING_MISSING, best=None, names=(), advice="", unexplained=left)
 
