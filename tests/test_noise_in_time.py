@@ -17,12 +17,16 @@ def electrons(rng, exposure_s: float, rate: np.ndarray, waiting_s: float = 0.0) 
     return shot + READ_E * rng.standard_normal(shot.shape)
 
 
-def fit(change=lambda rng, e: e, waiting_s: float = 0.0) -> hsnoise.FitResult:
+def capture(change=lambda rng, e: e, waiting_s: float = 0.0) -> hsnoise.FrameStack:
     rng = np.random.default_rng(4)
     rate, offset = 40 * rng.lognormal(-0.08, 0.4, SHAPE), rng.normal(0, 1.0, SHAPE)
     of = [change(rng, electrons(rng, t, rate, waiting_s)) for t in EXPOSURE_S]
     counts = [np.clip(np.rint(200 + offset + GAIN * e), 0, 65535).astype(np.uint16) for e in of]
-    return hsnoise.fit(hsnoise.FrameStack(counts, EXPOSURE_S, white_level=65535, shutter="global"))
+    return hsnoise.FrameStack(counts, EXPOSURE_S, white_level=65535, shutter="global")
+
+
+def fit(*of, **keywords) -> hsnoise.FitResult:
+    return hsnoise.fit(capture(*of, **keywords))
 
 
 def filtered(share: float):
@@ -64,3 +68,8 @@ def test_dark_signal_without_exposure_is_told():
     told = [note for note in fit(waiting_s=0.2).notes if "longer" in note]
     assert told and "lasted 0.2 s longer" in told[0]
     assert not any("longer:" in note for note in fit().notes)
+
+
+def test_inspect_says_so_before_any_fit():
+    assert any("frame before" in one for one in hsnoise.inspect(capture(filtered(0.1))).findings)
+    assert not hsnoise.inspect(capture(of_frames_and_rows)).findings

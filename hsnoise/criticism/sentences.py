@@ -298,7 +298,7 @@ def because(nearer: Sequence[str], score: float, is_nearest: bool) -> str:
 
 def added(step: int, name: str, reason: str, before: float, after: float, fell: str) -> str:
     """Why a step was taken, and how the error changed; fell: what else fell."""
-    return f"Step {step}: added {name}, because {reason}; error {before:.2f} -> {after:.2f}{fell}."
+    return f"Step {step}: added {name}, because {reason}; error {number(before)} -> {number(after)}{fell}."
 
 
 def closed(error: float, worst: Share | None) -> str:

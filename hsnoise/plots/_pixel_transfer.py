@@ -48,7 +48,7 @@ def pixel_transfer(fit) -> Figure:
         _gains(grid[1, i], name, transfer, _gain_of(fit, name))
         _residuals(grid[2, i], name, transfer)
         grid[0, i].set_title(
-            f"{NAMES[name]}: χ² = {transfer.chi2:.1f} for {transfer.dof:.1f} degrees of freedom", fontsize=10
+            f"{NAMES[name]}: χ² = {transfer.chi2:.0f} for {transfer.dof:.0f} degrees of freedom", fontsize=10
         )
         grid[2, i].set_xlabel("dark signal / DN")
     for axes, label in zip(grid[:, 0], ("temporal variance / DN²", "gain / (DN/e$^-$)", "residual / σ"), strict=True):

@@ -61,7 +61,8 @@ def lags(sheet: Sheet, x: Exposures) -> None:
 
 
 def _away(lag: tuple[int, int]) -> str:
-    return f"{lag[0]} rows {lag[1]} columns away"
+    rows, columns = (f"{n} {what}{'' if n == 1 else 's'}" for n, what in zip(lag, ("row", "column"), strict=True))
+    return f"{rows}, {columns} away" if all(lag) else f"{rows if lag[0] else columns} away"
 
 
 def _sum_to_zero(x: Exposures, lag: tuple[int, int]) -> float:

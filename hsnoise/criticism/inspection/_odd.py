@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
+from hsnoise.statistics.pixels.memory import together
 from hsnoise.statistics.pixels.oddities import brighter_kind
 
 FAR = 6.0  # robust deviations from which a frame is odd
@@ -21,6 +22,7 @@ BRIGHTER = 1.3  # hot pixels of a shorter exposure against a longer one's
 FLICKER = 0.02  # of a flat's level
 OFF_LINE = 0.05  # of the light of flats
 DIM = 0.05  # of the brightest flat: the light of dimmer ones is not compared
+LEAST_NOISE_DN = 0.5  # of a pixel
 ALIKE = 0.15  # of the signal: darks whose pixels differ less are lit
 
 
@@ -42,7 +44,19 @@ def odd_frames(facts: Facts, *, multiplies: bool = False) -> list[str]:
         *_swapped(darks),
         *_unlit(facts.groups),
         *_off_line(facts.groups),
+        *_filtered(darks),
     ]
+
+
+def _filtered(darks: Sequence[GroupFacts]) -> list[str]:
+    """Noise of a pixel that is in the next frame, too; where a count is wider than the noise, levels decide it."""
+    clear = [
+        group
+        for group in darks
+        if group.temporal_dn > LEAST_NOISE_DN and len({frame.fingerprint for frame in group.frames}) == group.n_frames
+    ]
+    memory = together([group.memory for group in clear if group.memory is not None])
+    return [] if memory is None else [memory.sentence.rstrip(".")]
 
 
 def _identical(groups: Sequence[GroupFacts]) -> list[str]:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.along_rows import of_the_signal
-from hsnoise.statistics.pixels.memory import Memory
+from hsnoise.statistics.pixels.memory import Memory, together
 from hsnoise.statistics.pixels.oddities import smoothed
 from hsnoise.statistics.pixels.survey import Survey
 
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
-SURE = 5.0  # standard errors of the share that frames have in common
 LEAST_NOISE_DN = 0.5  # with less, where a level lies between two counts decides which frames agree
 
 
@@ -25,7 +22,7 @@ def shared_noise(result: FitResult, found: Survey) -> tuple[tuple[str, ...], tup
     shared = of_the_signal(found.along)
     coupled = () if spread else tuple(_coupled(shared))
     memory = None if "image_lag" in result.params else _memory(found)
-    kept = () if memory is None else tuple(_remembered(memory))
+    kept = () if memory is None else (memory.sentence,)
     is_much = [abs(2 * sum(shared)) > MOST_COUPLED, memory is not None and 2 * memory.share > MOST_COUPLED]
     both = list(zip((coupled, kept), is_much, strict=True))
     of_size = [tuple(one for told, much in both if much is size for one in told) for size in (True, False)]
@@ -48,23 +45,6 @@ def _coupled(shared: tuple[float, float]) -> Iterator[str]:
 
 
 def _memory(found: Survey) -> Memory | None:
-    """What pixels keep of the frame before, of all darks together; None where it is too little to matter.
-
-    Light may differ from frame to frame, so flats say nothing.
-    """
+    """What pixels keep of the frame before, in all darks: light may differ from frame to frame."""
     wide = [group for group in found.repeated_darks if group.noise_dn > LEAST_NOISE_DN]
-    told = [p.halves.memory for group in wide for p in group.planes if p.halves.memory is not None]
-    if not told:
-        return None
-    weight = np.array([one.error for one in told]) ** -2.0
-    share = float(weight @ [one.share for one in told] / weight.sum())
-    memory = Memory(share, float(weight.sum() ** -0.5))
-    return memory if memory.exceeds(COUPLED / 2, SURE) else None
-
-
-def _remembered(memory: Memory) -> Iterator[str]:
-    yield (
-        f"Pixels have {memory.share:.1%} of their noise in common with the frame before: a filter over frames (temporal"
-        " noise reduction in the camera), or image lag. Variances come out too small by"
-        f" {2 * memory.share:.0%} or more, and so do gain or noise. Switch the filter off."
-    )
+    return together([p.halves.memory for group in wide for p in group.planes if p.halves.memory is not None])

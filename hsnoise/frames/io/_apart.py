@@ -122,7 +122,7 @@ def _main_size(read: Sequence[Recording]) -> tuple[int, int]:
         one, two = (next(r for r in read if r.size == size) for size in tied[:2])
         raise ValueError(
             f"{two.path}: frames of {two.size} pixels, those of {one.path} have {one.size}, and there are equally many"
-            " of both; all frames must have one size"
+            " of both; all frames must have one size: name the files, or the folder, of one of them"
         )
     return tied[0]
 

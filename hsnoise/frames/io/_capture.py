@@ -142,7 +142,8 @@ def _check_exposures(read: list[Recording], source: str) -> None:
         value = recording.exposure_s
         if value is None:
             raise ValueError(
-                f"{recording.path}: no exposure time (looked for {source}); give {setting('exposure_s')}, in seconds"
+                f"{recording.path}: no exposure time (looked for {source}); give {setting('exposure_s')}, in"
+                " seconds, one for all files or one for each, or name files or folders by it (dark_30s_01.tif)"
             )
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{recording.path}: expected an exposure_s >= 0, got {value} s")

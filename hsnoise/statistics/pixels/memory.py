@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 FEWEST_FRAMES = 4
 PARTS, MOST_PIXELS = 16, 1 << 18  # of a plane, which tell the error
 WIDTH = 4.0  # deviations at which differences are cut: jumping and hit pixels say nothing here
+LEAST, SURE = 0.01, 5.0  # share that matters, and its standard errors
 
 
 class Memory(NamedTuple):
@@ -17,8 +19,31 @@ class Memory(NamedTuple):
     share: float
     error: float
 
-    def exceeds(self, least: float, sigmas: float) -> bool:
-        return self.share > max(least, sigmas * self.error)
+    @property
+    def sentence(self) -> str:
+        return (
+            f"Pixels have {self.share:.1%} of their noise in common with the frame before: a filter over frames"
+            " (temporal noise reduction in the camera), or image lag (hsnoise diagnose may name it). Variances come out"
+            f" too small by {2 * self.share:.0%} or more, and so do gain or noise. Switch a filter off."
+        )
+
+
+def together(told: Sequence[Memory]) -> Memory | None:
+    """Of all planes and exposures; None where it may be chance, or is too little to matter."""
+    if not told:
+        return None
+    weight = np.array([max(one.error, 1e-6) for one in told]) ** -2.0
+    share, error = float(weight @ [one.share for one in told] / weight.sum()), float(weight.sum() ** -0.5)
+    return Memory(share, error) if share > max(LEAST, SURE * error) else None
+
+
+def memory_of_region(counts: np.ndarray) -> Memory | None:
+    """Of counts [frame, row, column], of which some rows suffice."""
+    rows = counts[:, : max(MOST_PIXELS // counts.shape[2], 1)].astype(np.float32)
+    rows -= rows.mean(0)
+    rows -= np.median(rows, axis=2, keepdims=True)
+    rows -= np.median(rows, axis=1, keepdims=True)
+    return memory_of(rows.reshape(len(rows), -1))
 
 
 def memory_of(values: np.ndarray) -> Memory | None:
