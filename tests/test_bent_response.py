@@ -34,8 +34,15 @@ def capture(rng, short=0.0, spread=0.0, cfa="mono", lights=LIGHTS):
     return FrameStack.join(darks, flats)
 
 
-@pytest.mark.parametrize("short", [0.04, -0.04])
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize(
+    ("cfa", "short"),
+    [
+        ("mono", 0.04),
+        ("RGGB", -0.04),
+        pytest.param("mono", -0.04, marks=pytest.mark.slow),
+        pytest.param("RGGB", 0.04, marks=pytest.mark.slow),
+    ],
+)
 def test_a_bent_response_is_measured_and_drawn(rng, short, cfa):
     """Without it a right gain was red: 215 for a response that falls 3 % short. The photo response fell, too."""
     stack = capture(rng, short, cfa=cfa)
@@ -75,7 +82,7 @@ def test_a_bend_that_is_not_quite_significant_widens_the_error_of_the_gain(rng):
     assert abs(found[1][0]) < 2 * found[1][1]
 
 
-@pytest.mark.parametrize("spread", [0.01, 0.02])
+@pytest.mark.parametrize("spread", [pytest.param(0.01, marks=pytest.mark.slow), 0.02])
 def test_electrons_that_spread_are_no_bent_response(rng, spread):
     """The variance falls as much as where the response bends, but neighbours share what is missing."""
     stack = capture(rng, spread=spread)

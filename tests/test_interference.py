@@ -84,7 +84,9 @@ def test_small_frames_and_single_ones_show_none():
     assert middle_of_frame(np.zeros((2001, 47))).shape == (512, 46)
 
 
-@pytest.mark.parametrize(("amplitude_e", "cfa"), [(1.0, "mono"), (1.0, "RGGB"), (3.0, "mono")])
+@pytest.mark.parametrize(
+    ("amplitude_e", "cfa"), [pytest.param(1.0, "mono", marks=pytest.mark.slow), (1.0, "RGGB"), (3.0, "mono")]
+)
 def test_a_fit_measures_it_and_its_frames_look_alike(amplitude_e, cfa):
     stack = capture(0.1234, 0.3456, amplitude_e, cfa=cfa)
     fit = hsnoise.fit(stack)

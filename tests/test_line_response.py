@@ -52,7 +52,7 @@ def responses(fit):
 NAMES = ("sigma", "row_sigma", "column_sigma", "row_parity", "column_parity")
 
 
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("cfa", ["mono", pytest.param("RGGB", marks=pytest.mark.slow)])
 def test_responses_of_lines_are_measured_and_drawn(rng, cfa):
     """They were in no model: sensors with stripes in flats had even samples, and `compare` did not see it."""
     truth = {"row_sigma": 0.002, "column_sigma": 0.003, "row_parity": -0.004, "column_parity": 0.01}
@@ -91,7 +91,7 @@ def test_a_parity_counts_from_the_sensor(rng):
     assert abs(signs[0] - 0.01) < 0.001 and abs(signs[1] + 0.01) < 0.001
 
 
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("cfa", [pytest.param("mono", marks=pytest.mark.slow), "RGGB"])
 def test_outputs_are_told_from_responses_by_their_noise(rng, cfa):
     """Two outputs whose gains differ make even and odd columns differ in light as two responses do."""
     stack = capture(rng, outputs=0.02, cfa=cfa)

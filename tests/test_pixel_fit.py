@@ -53,7 +53,11 @@ def test_gain_and_read_noise_are_those_of_the_sensor(kind):
 
 @pytest.mark.parametrize(
     ("spread", "exposure_s", "hot"),
-    [(0.3, (0.05, 2.0), 0.0), (0.8, (0.5, 3.0), 0.0), pytest.param(0.5, (0.1, 0.5, 2.0), 0.01, marks=pytest.mark.slow)],
+    [
+        pytest.param(0.3, (0.05, 2.0), 0.0, marks=pytest.mark.slow),
+        (0.8, (0.5, 3.0), 0.0),
+        pytest.param(0.5, (0.1, 0.5, 2.0), 0.01, marks=pytest.mark.slow),
+    ],
 )
 def test_skewed_dark_currents_leave_the_black_level_right(spread, exposure_s, hot):
     """A line through the medians of all pixels had the growth of no pixel: 0.3 DN, 13 errors."""

@@ -208,7 +208,7 @@ def response_of(cfa, shape=(96, 128)):
     return np.asarray(hsnoise.sample(0, np.ones((1, *shape)), model, sensor_key=jax.random.key(5)))[0]
 
 
-@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+@pytest.mark.parametrize("cfa", [pytest.param("mono", marks=pytest.mark.slow), "RGGB"])
 def test_flats_give_the_response_of_each_pixel(cfa):
     stack = lit_sensor(cfa)
     found = closed(model_of(*BASE, fx.PhotoResponseNonuniformity(0.02), cfa=cfa), stack)
@@ -244,7 +244,7 @@ def test_flats_of_one_frame_leave_the_response_to_its_law():
     assert "flats, noise" not in found.comparison.groups
 
 
-@pytest.mark.parametrize(("bends", "loss"), [("sensor", 6e-6), ("lamp", 0.0)])
+@pytest.mark.parametrize(("bends", "loss"), [pytest.param("sensor", 6e-6, marks=pytest.mark.slow), ("lamp", 0.0)])
 def test_a_bent_response_is_the_sensors_if_the_noise_of_flats_bends_too(bends, loss):
     exposures_s, shape = np.array([1.0, 2.0, 4.0, 6.0, 8.0, 10.0]), (64, 96)
     truth = model_of(*BASE, fx.Nonlinearity(loss))

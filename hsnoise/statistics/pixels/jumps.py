@@ -20,7 +20,7 @@ FEWEST, LEAST = 100, 3e-4  # pixels that jump visibly, and their share
 TOGETHER = 2.0  # times as many noisy in both halves as by chance: heavy tails strike any pixel
 MANY, ROUNDS = 0.1, 3  # share of pixels that move the median; how often it is corrected
 SURE = 2.5  # standard errors of fraction and amplitude
-FAILS, FAR_BETTER = 2.0, 0.5  # chi-square of normal noise per degree of freedom; how much of it jumps may leave
+FAILS, FAR_BETTER = 2.0, 0.6  # chi-square of normal noise per degree of freedom; how much of it jumps may leave
 
 
 def jumps_of(found: Survey, channel: int) -> tuple[Jumps | None, np.ndarray]:
