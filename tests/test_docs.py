@@ -233,6 +233,7 @@ def test_page_runs(page, library, folder, request, monkeypatch, capsys):
 
 
 def _own_effect(page) -> None:
+    assert page.without.verdict != "named"
     assert page.found.best.name == page.found.ranking[0].name == "chessboard"
     assert 0.5 < page.found.best.effect.offset < 2  # a first estimate of 1
 

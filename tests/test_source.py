@@ -77,7 +77,9 @@ def test_every_function_loads_a_path_and_says_what_load_says(call, folder):
     for nowhere in ("no such folder", Path("no such folder"), [folder / NAMES[0], "no such folder"]):
         with pytest.raises(FileNotFoundError, match="^path: no such file or folder: no such folder$"):
             call(nowhere)
-    with pytest.raises(ValueError, match=r"dark_0\.npy: no exposure time .*; give exposure_s=, in seconds"):
+    with pytest.raises(
+        ValueError, match=r"dark_0\.npy: no exposure time .*; give exposure_s=, in seconds, one for all .*_01\.tif\)$"
+    ):
         call(folder)
     with pytest.raises(ValueError, match="^shutter: expected one of 'rolling', 'global', got 'leaf'$"):
         call([folder / name for name in NAMES], exposure_s=EXPOSURE_S, shutter="leaf")

@@ -207,7 +207,7 @@ def _channel(
         transfer = pixel_transfer(classes_less(pixels, found.full_scale_dn, row_gain(growth), rays))
     if transfer is not None and pixels is not None:
         glow = glow_of(found, c)
-        of_glow = None if glow is None else glow_of_pixels(glow, found, c)[~found.stuck(c)][~pixels.noisy.all(0)]
+        of_glow = None if glow is None else glow_of_pixels(glow, found, c)[~found.stuck(c)][pixels.is_calm]
         population = _population(found, c, pixels.calm(), transfer, of_glow)
         values, covariance = _transferred(transfer, at_rest, population, (jumps, raised), tail)
     if found.code_step > 1:

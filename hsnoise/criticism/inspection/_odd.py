@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
-from hsnoise.statistics.pixels.memory import together
+from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, together
 from hsnoise.statistics.pixels.oddities import brighter_kind
 
 FAR = 6.0  # robust deviations from which a frame is odd
@@ -22,7 +22,6 @@ BRIGHTER = 1.3  # hot pixels of a shorter exposure against a longer one's
 FLICKER = 0.02  # of a flat's level
 OFF_LINE = 0.05  # of the light of flats
 DIM = 0.05  # of the brightest flat: the light of dimmer ones is not compared
-LEAST_NOISE_DN = 0.5  # of a pixel
 ALIKE = 0.15  # of the signal: darks whose pixels differ less are lit
 
 
@@ -49,7 +48,7 @@ def odd_frames(facts: Facts, *, multiplies: bool = False) -> list[str]:
 
 
 def _filtered(darks: Sequence[GroupFacts]) -> list[str]:
-    """Noise of a pixel that is in the next frame, too; where a count is wider than the noise, levels decide it."""
+    """Noise of a pixel that is in the next frame, too."""
     clear = [
         group
         for group in darks

@@ -6,27 +6,26 @@ from collections.abc import Iterator
 
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.along_rows import of_the_signal
-from hsnoise.statistics.pixels.memory import Memory, together
+from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, Memory, together
 from hsnoise.statistics.pixels.oddities import smoothed
 from hsnoise.statistics.pixels.survey import Survey
 
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
-LEAST_NOISE_DN = 0.5  # with less, where a level lies between two counts decides which frames agree
 
 
-def shared_noise(result: FitResult, found: Survey) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def shared_noise(result: FitResult, found: Survey) -> tuple[list[str], list[str]]:
     """Sentences on what makes numbers wrong, and on what makes them a little wrong."""
-    pixel = result.transfer
-    smooth = () if pixel is not None and pixel.ringing is not None else tuple(smoothed(found))
-    spread = pixel is not None and any(one.bend.spreads for one in pixel.channels)
-    shared = of_the_signal(found.along)
-    coupled = () if spread else tuple(_coupled(shared))
+    pixel, shared = result.transfer, of_the_signal(found.along)
+    much: list[str] = []
+    little: list[str] = []
+    if pixel is None or pixel.ringing is None:
+        much += smoothed(found)
+    if pixel is None or not any(one.bend.spreads for one in pixel.channels):
+        (much if abs(2 * sum(shared)) > MOST_COUPLED else little).extend(_coupled(shared))
     memory = None if "image_lag" in result.params else _memory(found)
-    kept = () if memory is None else (memory.sentence,)
-    is_much = [abs(2 * sum(shared)) > MOST_COUPLED, memory is not None and 2 * memory.share > MOST_COUPLED]
-    both = list(zip((coupled, kept), is_much, strict=True))
-    of_size = [tuple(one for told, much in both if much is size for one in told) for size in (True, False)]
-    return (*smooth, *of_size[0]), of_size[1]
+    if memory is not None:
+        (much if 2 * memory.share > MOST_COUPLED else little).append(memory.sentence)
+    return much, little
 
 
 def _coupled(shared: tuple[float, float]) -> Iterator[str]:

@@ -77,13 +77,17 @@ class Levels(NamedTuple):
     pedestal_sigma_dn: np.ndarray
     noisy: np.ndarray
 
+    @property
+    def is_calm(self) -> np.ndarray:
+        """Which pixels do not look noisy in both halves [pixel]."""
+        return np.logical_not(np.all(self.noisy, axis=0))
+
     def calm(self) -> Levels:
-        """Of the pixels that do not look noisy in both halves."""
-        kept = ~self.noisy.all(0)
-        if kept.all():
+        """Of the calm pixels."""
+        if self.is_calm.all():
             return self
         names = "level", "variance", "peak", "whole_variance", "noisy"
-        return self._replace(**{name: getattr(self, name)[..., kept] for name in names})
+        return self._replace(**{name: getattr(self, name)[..., self.is_calm] for name in names})
 
 
 def levels_of(found: Survey, channel: int, noisy: np.ndarray | None = None) -> Levels | None:

@@ -10,6 +10,7 @@ import numpy as np
 FEWEST_FRAMES = 4
 PARTS, MOST_PIXELS = 16, 1 << 18  # of a plane, which tell the error
 WIDTH = 4.0  # deviations at which differences are cut: jumping and hit pixels say nothing here
+LEAST_NOISE_DN = 0.5  # of a pixel; where a count is wider than the noise, levels decide which frames agree
 LEAST, SURE = 0.01, 5.0  # share that matters, and its standard errors
 
 
