@@ -7,6 +7,8 @@ import pytest
 
 import hsnoise
 from hsnoise.criticism.closing import closed
+from hsnoise.criticism.held_out import split_frames
+from hsnoise.simulation.portion import Portion
 from hsnoise.statistics.pixels.settling import settling_of
 
 SHAPE = (64, 96)
@@ -54,6 +56,19 @@ def test_a_model_with_the_course_is_like_the_frames():
     assert hsnoise.compare(fit, stack).fits
     assert hsnoise.compare(fit.params.remove("frame_settling"), stack).error > 5
     assert closed(fit, stack).comparison.groups["level"] < 5  # the course is in no map
+
+
+@pytest.mark.slow
+def test_frames_held_out_are_later_ones_of_the_course():
+    stack = drawn(settling, frames=24)
+    first, last = split_frames(Portion.of(stack).darks.frames, stack)
+    fit = hsnoise.fit(first)
+    found = closed(fit, first, held_out=last, before=(18,))
+    assert found.comparison.groups["level"] < 5 and found.before.groups["level"] < 5
+    of_frames = [share for share in found.shares if share.component == "frame"]
+    assert of_frames and all(share.unexplained == 0 for share in of_frames)
+    with pytest.raises(ValueError, match="before: expected a number for each of 1 exposures held out"):
+        closed(fit, first, held_out=last, before=(18, 18))
 
 
 def test_exposures_of_one_course_tell_it():

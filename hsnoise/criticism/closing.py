@@ -7,6 +7,7 @@ measured frames and frames drawn from the model, until they agree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,7 +105,15 @@ class ClosedModel:
     __repr__ = __str__
 
 
-def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: int = 0, **keywords) -> ClosedModel:
+def closed(
+    model: Any,
+    stack: Any,
+    *,
+    held_out: FrameStack | None = None,
+    before: Sequence[int] = (),
+    seed: int = 0,
+    **keywords,
+) -> ClosedModel:
     """Close a model with what is measured of one sensor: the best realism, and a measure of how much names explain.
 
     Args:
@@ -114,6 +123,8 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
             are used, flats of two frames or more for the response of each pixel, and flats of five levels or more for
             the response of all.
         held_out: other darks of the same sensor, to judge by, beside the flats; None: the frames themselves.
+        before: for each exposure of `held_out`, how many frames of its series come before it, by which a level that
+            settles is told; default: none.
         seed: of all draws.
 
     Raises:
@@ -127,9 +138,8 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
     if missing:
         raise ValueError(f"model: expected a model with {' and '.join(NEEDED)}, this one lacks {', '.join(missing)}")
     darks, flats = repeated_darks(stack), _flats(stack)
-    judging = darks if held_out is None else repeated_darks(held_out)
-    judging = judging if flats is None else with_flats(judging, flats)
-    judge, bad = Portion.of(judging), _defects(judging)
+    in_series = any(effect.in_series for effect in params)
+    judge, bad = _judge(darks if held_out is None else held_out, before if in_series else (), flats)
     with jax.enable_x64(True):
         closing = _Closing.of(darks, params, seed)
         models = [closing.nearer(start) for start in closing.starts(params)]
@@ -146,7 +156,7 @@ def closed(model: Any, stack: Any, *, held_out: FrameStack | None = None, seed: 
         named=params,
         replaced=replaced,
         overshot=tuple(effect.name for effect in gone if effect.name not in replaced),
-        shares=shares.shares_of(params, judge.darks.frames, key, closed=found),
+        shares=shares.shares_of(params, judge.darks.frames, key, closed=found, before=judge.darks.before),
         static=_static(params, judge.darks.frames, key, replaced),
         comparison=comparison,
         before=compared(params, judge, seed=seed),
@@ -157,6 +167,17 @@ def _nearest(models: list[NoiseModel], judge: Portion, bad: np.ndarray, seed: in
     """The model whose flats are nearest to those of `judge`, and its comparison."""
     found = [(model, compared(_sound(model, bad), judge, seed=seed)) for model in models]
     return min(found, key=lambda one: sum(one[1].groups.get(group, 0.0) for group in OF_FLATS.values()))
+
+
+def _judge(darks: FrameStack, before: Sequence[int], flats: FrameStack | None) -> tuple[Portion, np.ndarray]:
+    """The frames to judge by, and their defects [row, column]."""
+    if before and len(before) != darks.n_exposures:
+        raise ValueError(f"before: expected a number for each of {darks.n_exposures} exposures held out, got {before}")
+    ahead = [before[i] for i in darks.repeated_darks] if before else []
+    judging = repeated_darks(darks)
+    judging = judging if flats is None else with_flats(judging, flats)
+    ahead += [0] * (judging.n_exposures - len(ahead)) if ahead else []
+    return Portion.of(judging, before=tuple(ahead)), _defects(judging)
 
 
 def _defects(stack: FrameStack) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hsnoise.criticism import sentences
 from hsnoise.criticism.outcomes import Improvement
+from hsnoise.effects import AbstractEffect
 from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
@@ -19,6 +20,7 @@ from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import structure
 
 SHARE, LEAST_HELD_OUT, LEAST_FITTED = 0.25, 2, 4  # of the dark frames of an exposure
+LEAST_IN_SERIES = 4  # frames that tell what passes from one to the next from what stays
 DRAWS, LEAST_DRAWS = 96, 40  # of a model that is judged
 GROUPS = 8  # of draws; without one after the other (jackknife), they tell the error of the simulation
 MOST_DRAWN = 60_000_000  # pixels of the draws of a model
@@ -52,8 +54,12 @@ def split_in_words(fitted: FrameStack, held_out: FrameStack | None) -> str:
     """Which frames were fitted and which held out, in words."""
     if held_out is None:
         return ""
-    kept = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
-    return sentences.frames_apart(kept, held_out.n_frames)
+    return sentences.frames_apart(frames_of_darks(fitted), held_out.n_frames)
+
+
+def frames_of_darks(stack: FrameStack) -> tuple[int, ...]:
+    """The number of frames of each dark exposure."""
+    return tuple(n for n, kind in zip(stack.n_frames, stack.kind, strict=True) if kind == "dark")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +87,15 @@ class Judge:
     @staticmethod
     def of(fitted: FrameStack, held_out: FrameStack, seed: int) -> Judge:
         """Of the darks held out from a fit, and of its flats."""
-        before = [n for n, kind in zip(fitted.n_frames, fitted.kind, strict=True) if kind == "dark"]
+        before = frames_of_darks(fitted)
         flats = [i for i, kind in enumerate(fitted.kind) if kind == "flat"]
         stack = with_flats(held_out, fitted.select(exposures=flats)) if flats else held_out
         return Judge(Portion.of(stack, before=(*before, *[0] * len(flats))), True, seed)
+
+    def of_effect(self, effect: AbstractEffect, fitted: Portion) -> Judge:
+        """This judge; for what passes from frame to frame, which few frames held out do not show, the fitted ones."""
+        few = min(self.portion.darks.frames.n_frames) < LEAST_IN_SERIES
+        return Judge(fitted, False, self.seed) if self.unseen and effect.in_series and few else self
 
     @cached_property
     def without_flats(self) -> Judge:

@@ -19,7 +19,7 @@ from hsnoise.criticism.closing import closed, repeated_darks
 from hsnoise.criticism.compare import DRAWS, Comparison, compared, with_shares
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.finding import Diagnosis
-from hsnoise.criticism.held_out import Judge, score_of_side, split_frames, split_in_words
+from hsnoise.criticism.held_out import Judge, frames_of_darks, score_of_side, split_frames, split_in_words
 from hsnoise.criticism.limit import NO_LIMIT, Limit, TimeIsUp
 from hsnoise.criticism.outcomes import (
     Ended,
@@ -152,7 +152,8 @@ def improved(
     log.info("Improved: %s", story.ended)
     if close:
         work.say(_stage("closing with measured components", steps))
-        found = closed(story.fit, fitted, held_out=held_out, seed=seed)
+        before = () if held_out is None else frames_of_darks(fitted)
+        found = closed(story.fit, fitted, held_out=held_out, before=before, seed=seed)
         if found.helps:
             return replace(story, closed=found)
         return replace(story, left_open=sentences.left_open(found.before.total, found.comparison.total))
@@ -290,21 +291,24 @@ class _Work:
         refused: dict[str, Refusal] = {}
         for candidate in candidates:
             found = self.with_one_more(steps, candidate)
-            why = Refusal(Refused.NOT_FITTED) if found is None else self.judged(steps, found[0], candidate.name)
+            judge = self.judge.of_effect(candidate.effect, self.portion)
+            why = Refusal(Refused.NOT_FITTED) if found is None else self.judged(judge, steps, found[0], candidate.name)
             if isinstance(why, Improvement):
-                step = self.step(found[0], candidate.name, steps)
-                held_out = steps[-1].held_out + why.nats  # NaN if no frames are held out
-                step = replace(step, held_out=held_out, held_out_error=why.error, ahead=found[1])
+                step = replace(self.step(found[0], candidate.name, steps), ahead=found[1])
+                if judge is self.judge:  # NaN if no frames are held out
+                    step = replace(step, held_out=steps[-1].held_out + why.nats, held_out_error=why.error)
+                else:
+                    step = replace(step, held_out=self.judge.score(step.fit.params), gained=why.nats)
                 return replace(step, fit=rechecked(step.fit, self.fitted)), refused
             refused[candidate.name] = why
             self.say(Event(f"{candidate.name} is left out: {sentences.refusal(why)}"))
         return None, refused
 
-    def judged(self, steps: list[Step], result: FitResult, added: str) -> Improvement | Refusal:
-        """What the judge says of a fit with one effect more."""
-        stage = _stage(f"judging {added} by frames {'held out' if self.judge.unseen else 'that were fitted'}", steps)
+    def judged(self, judge: Judge, steps: list[Step], result: FitResult, added: str) -> Improvement | Refusal:
+        """What a judge says of a fit with one effect more."""
+        stage = _stage(f"judging {added} by frames {'held out' if judge.unseen else 'that were fitted'}", steps)
         self.say(stage)
-        return judged(self.judge, steps[-1].fit, result, added, self.counter(stage))
+        return judged(judge, steps[-1].fit, result, added, self.counter(stage))
 
     def with_one_more(self, steps: list[Step], candidate: Candidate) -> tuple[FitResult, float] | None:
         """A fit with the candidate, on the side of the gain where it fits better, and by how much, nats.

@@ -217,6 +217,14 @@ def gained(nats: float, error: float) -> str:
     return f"{nats:+.1f} ± {error:.1f} nats"
 
 
+def by_fitted(nats: float) -> str:
+    """Why frames of the fit judged an addition, and what they gained by it."""
+    return (
+        "What passes from frame to frame hardly shows in so few frames held out; those of the fit are predicted better"
+        f" by {nats:.1f} nats."
+    )
+
+
 def ended_in_short(ending: Ending, missing: str) -> str:
     """How a story ended, without a full stop; missing: what the last diagnosis named."""
     unit = f"{UNITS.get(ending.why, '')}{'' if ending.limit == 1 else 's'}"

@@ -105,14 +105,19 @@ class Share(NamedTuple):
 
 
 def shares_of(
-    named: NoiseModel, frames: FrameStack, key: RandomKey, closed: NoiseModel | None = None
+    named: NoiseModel,
+    frames: FrameStack,
+    key: RandomKey,
+    closed: NoiseModel | None = None,
+    before: Sequence[int] = (),
 ) -> tuple[Share, ...]:
     """The shares of each component of the noise of dark `frames`, two or more of each exposure, by draws of the model.
 
-    Raises ValueError for an exposure of one frame.
+    before: for each exposure, how many frames of the series come before these; default: none. Raises ValueError for an
+    exposure of one frame.
     """
-    drawn = {"named": _drawn(named, frames, named_key(key, "named"))}
-    drawn["closed"] = drawn["named"] if closed is None else _drawn(closed, frames, named_key(key, "closed"))
+    drawn = {"named": _drawn(named, frames, named_key(key, "named"), before)}
+    drawn["closed"] = drawn["named"] if closed is None else _drawn(closed, frames, named_key(key, "closed"), before)
     found = []
     for (i, channel), measured in _components(frames).items():
         parts = {name: [one[i, channel] for one in of] for name, of in drawn.items()}
@@ -183,9 +188,11 @@ def static_dn2(frames: FrameStack) -> float:
     return _static([_components(frames)])
 
 
-def _drawn(model: NoiseModel, like: FrameStack, key: RandomKey) -> list[dict[Place, Components]]:
+def _drawn(
+    model: NoiseModel, like: FrameStack, key: RandomKey, before: Sequence[int] = ()
+) -> list[dict[Place, Components]]:
     return in_threads(
-        lambda number: _components(draw_capture(jax.random.fold_in(key, number), model, like)), range(DRAWS)
+        lambda number: _components(draw_capture(jax.random.fold_in(key, number), model, like, before)), range(DRAWS)
     )
 
 

@@ -37,6 +37,7 @@ class Step:
         moved: base parameters that changed by more than two standard errors in this step, in words.
         ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
         held_out_error: standard error of the change of `held_out` from the step before, by its simulation, nats.
+        gained: nats that frames of the fit gained by what was added, where they judged it; NaN if held-out ones did.
     """
 
     fit: FitResult
@@ -47,6 +48,7 @@ class Step:
     moved: tuple[str, ...] = ()
     ahead: float = float("nan")
     held_out_error: float = float("nan")
+    gained: float = float("nan")
 
     @property
     def sizes(self) -> tuple[str, ...]:
@@ -54,7 +56,8 @@ class Step:
         if self.added is None:
             return ()
         effect = self.fit.params[self.added]
-        return sentences.sizes(self.fit.in_dn(self.added), effect, self.ahead < rules.SIDES_APART)
+        sizes = sentences.sizes(self.fit.in_dn(self.added), effect, self.ahead < rules.SIDES_APART)
+        return sizes if np.isnan(self.gained) else (*sizes, sentences.by_fitted(self.gained))
 
 
 @dataclass(frozen=True)

@@ -238,6 +238,6 @@ def _why(before: Step, after: Step) -> list[str]:
 
 def _gain(before: Step, after: Step) -> str:
     change = after.held_out - before.held_out
-    if not np.isfinite(change):
+    if not np.isfinite(change) or np.isfinite(after.gained):
         return ""
     return sentences.gained(change, after.held_out_error) if after.held_out_error > 0 else f"{change:+.1f} nats"

@@ -69,6 +69,20 @@ def test_a_series_goes_on_in_the_frames_held_out():
     assert begun_anew.improvement(MODEL, DRIFT, 1).nats < judge.improvement(MODEL, DRIFT, 1).nats - 10
 
 
+def test_two_frames_do_not_show_what_passes_from_one_to_the_next():
+    bright = MODEL.add(fx.DarkCurrent(400.0))
+    lag = bright.add(fx.ImageLag(0.1))
+    fitted, held_out = split(capture(lag), 6)
+    judge = Judge.of(fitted, held_out, 0)
+    of_fitted = judge.of_effect(lag["image_lag"], Portion.of(fitted))
+    assert judge.unseen and not of_fitted.unseen and of_fitted.portion.frames.n_frames == (6,) * 4
+    assert of_fitted.improvement(bright, lag, 1).nats > judge.improvement(bright, lag, 1).nats + 10
+    assert of_fitted.improvement(bright, lag, 1).holds
+    assert judge.of_effect(fx.RowNoise(1.0), Portion.of(fitted)) is judge
+    four = Judge.of(*split(capture(lag, 12), 8), 0)
+    assert four.of_effect(lag["image_lag"], Portion.of(fitted)) is four
+
+
 def test_later_frames_of_a_series_are_those_of_the_whole():
     whole = capture(DRIFT, 8)
     later = draw_capture(5, DRIFT, empty_stack(3), before=(5,) * 4)

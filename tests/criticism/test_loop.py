@@ -262,9 +262,10 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     of = importlib.import_module("hsnoise.criticism.improve")
     monkeypatch.setattr(_Work, "with_one_more", with_one_more)
     monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
-    monkeypatch.setattr(_Work, "judged", lambda self, steps, fit, name: why[name])
+    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: why[name])
     monkeypatch.setattr(of, "rechecked", lambda *of: checked)
-    work = _Work(None, None, None, 0, lambda event: told.append(str(event)))
+    judge = SimpleNamespace(of_effect=lambda effect, portion: judge)
+    work = _Work(None, None, judge, 0, lambda event: told.append(str(event)))
     reasons = {"row_noise": Refusal(Refused.NOT_FITTED), "frame_offset": alike}
     kept = Step(checked, None, None, "column_noise", held_out=10.0, ahead=9.0, held_out_error=2.0)
     assert work.first_that_holds(candidates, [before]) == (kept, reasons)
@@ -274,6 +275,22 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
         "frame_offset is left out: made no difference by itself (+0.5 ± 0.2 nats, of which chance gives 1)",
     ]
     assert work.first_that_holds(candidates[:2], [before]) == (None, reasons)
+
+
+def test_what_the_frames_of_the_fit_judged_is_told(monkeypatch):
+    """Frames held out then say only how likely they are."""
+    fit = SimpleNamespace(params={"image_lag": fx.ImageLag(0.04)}, in_dn=lambda name: {}, doubts=())
+    of = importlib.import_module("hsnoise.criticism.improve")
+    monkeypatch.setattr(_Work, "with_one_more", lambda *of: (fit, float("nan")))
+    monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
+    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: Improvement(30.0, 2.0, 1))
+    monkeypatch.setattr(of, "rechecked", lambda fit, frames: fit)
+    judge = SimpleNamespace(of_effect=lambda effect, portion: object(), score=lambda model: -25.0)
+    candidate = SimpleNamespace(name="image_lag", effect=fx.ImageLag(0.04))
+    work = _Work(None, None, judge, 0, lambda event: None)
+    step, _ = work.first_that_holds([candidate], [Step(fit, None, None, None, held_out=-20.0)])
+    assert step.held_out == -25.0 and np.isnan(step.held_out_error) and step.gained == 30.0
+    assert "those of the fit are predicted better by 30.0 nats" in step.sizes[-1]
 
 
 def test_what_was_tried_in_vain_is_told_with_the_reason():
