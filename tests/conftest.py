@@ -55,13 +55,15 @@ def forget_compiled_programs():
 def keep_compiled_programs(tmp_path_factory, worker_id):
     """On disk, for the modules to come and for the other workers: most of the tests' time is compilation.
 
-    A folder named in $JAX_COMPILATION_CACHE_DIR is kept from run to run.
+    A folder named in $JAX_COMPILATION_CACHE_DIR is kept from run to run. Commands that tests start use it, too.
     """
     folder = tmp_path_factory.getbasetemp()
     folder = folder if worker_id == "master" else folder.parent  # workers have folders of their own in one
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "compiled"))
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(jax.config.jax_compilation_cache_dir)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 
 @pytest.fixture(autouse=True, scope="module")

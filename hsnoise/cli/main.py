@@ -27,6 +27,7 @@ from hsnoise.cli import enhance as _enhance
 from hsnoise.cli import options as _options
 from hsnoise.cli import sample as _sample
 from hsnoise.cli.as_json import as_json
+from hsnoise.cli.compiled import keep_compiled_programs
 from hsnoise.cli.loading import load_capture, model_of, same_capture
 from hsnoise.cli.progress import busy, fit_with_progress
 from hsnoise.cli.results import check_folder, improve_with_progress, keep, story_in, write_results
@@ -114,6 +115,7 @@ def _run(argv: list[str] | None) -> int:
             warnings.showwarning = lambda message, *_, **__: console.print(
                 f"Note: {message}.", style="yellow", markup=False
             )
+            keep_compiled_programs()
             status = RUN[args.command](args) or 0
             sys.stdout.flush()  # notice here that it cannot be written
             return status

@@ -153,7 +153,10 @@ def improved(
     if close:
         work.say(_stage("closing with measured components", steps))
         before = () if held_out is None else frames_of_darks(fitted)
-        found = closed(story.fit, fitted, held_out=held_out, before=before, seed=seed)
+        try:
+            found = closed(story.fit, fitted, held_out=held_out, before=before, seed=seed)
+        except (RuntimeError, ValueError) as error:  # the steps were minutes of work
+            return replace(story, left_open=sentences.cannot_be_closed(error))
         if found.helps:
             return replace(story, closed=found)
         return replace(story, left_open=sentences.left_open(found.before.total, found.comparison.total))

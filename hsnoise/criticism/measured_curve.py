@@ -8,6 +8,7 @@ from hsnoise.effects import MeasuredResponse
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of
+from hsnoise.simulation.portion import is_saturated
 
 FEWEST_LEVELS = 5  # of light; a straight line takes two
 MOST_BENT = 0.1  # of the level: beyond, the light was not what it should have been
@@ -21,7 +22,7 @@ def with_response(model: NoiseModel, stack: FrameStack) -> NoiseModel:
     that opens late then shifts all of them, which is no response. A model without flats of FEWEST_LEVELS levels, or
     whose levels are straight within SURE errors or bend by more than MOST_BENT, is returned as it is.
     """
-    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat"]
+    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat" and not is_saturated(stack, i)]
     known = stack.photons_e is not None and np.isfinite(stack.photons_e[flats]).all()
     light = np.asarray(stack.photons_e if known else stack.exposure_s)[flats]
     if len(set(light)) < FEWEST_LEVELS:

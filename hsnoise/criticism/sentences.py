@@ -326,6 +326,11 @@ def left_open(named: float, closed: float) -> str:
     )
 
 
+def cannot_be_closed(error: Exception) -> str:
+    """Why a model could not be closed."""
+    return f"Not closed with measured components: {error}."
+
+
 def replaced(by_maps: Sequence[str], overshot: Sequence[str]) -> str:
     """Which named effects measured components stand for; empty if none."""
     said = []

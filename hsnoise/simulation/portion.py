@@ -61,7 +61,7 @@ class Portion:
             first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
-        bright = [i for i in range(part.n_exposures) if _is_saturated(part, i)]
+        bright = [i for i in range(part.n_exposures) if is_saturated(part, i)]
         lit = [i for i, kind in enumerate(part.kind) if kind == "flat"]
         full = [i for i in _beyond_the_range(part, lit) if i not in bright]
         if bright or full:
@@ -106,11 +106,11 @@ def usable_flats(stack: FrameStack) -> list[int]:
     """Flats of two frames or more that are neither saturated nor beyond the linear range; there must be darks."""
     repeated = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
     full = _beyond_the_range(stack, repeated)
-    return [i for i in repeated if i not in full and not _is_saturated(stack, i)]
+    return [i for i in repeated if i not in full and not is_saturated(stack, i)]
 
 
-def _is_saturated(stack: FrameStack, exposure: int) -> bool:
-    """Whether so many pixels of a flat are at the white level that it shows little else."""
+def is_saturated(stack: FrameStack, exposure: int) -> bool:
+    """Whether so many pixels of a flat's first frame are at the white level that it shows little else."""
     if stack.kind[exposure] != "flat" or stack.white_level is None:
         return False
     return float(np.mean(np.asarray(stack.counts[exposure][0]) >= stack.white_level)) > MOST_SATURATED

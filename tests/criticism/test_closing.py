@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from functools import lru_cache
 
+import dask.array as da
 import jax
 import numpy as np
 import pytest
@@ -255,6 +257,32 @@ def test_a_bent_response_is_the_sensors_if_the_noise_of_flats_bends_too(bends, l
     stack = hsnoise.FrameStack([darks, *counts], [1.0, *exposures_s], kind=kinds, shutter="global")
     found = closed(model_of(*BASE[:1], *BASE[2:]), stack)
     assert ("measured_response" in found.params) is (bends == "sensor")
+
+
+def test_saturated_levels_say_nothing_about_the_response():
+    """Their second frame may have more saturated pixels than a frame may have."""
+    rng, exposures_s = np.random.default_rng(1), [1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
+    straight = [100 + rng.poisson(20 * of, (2, 32, 32)) for of in exposures_s]
+    straight[-1] = np.minimum(100 + rng.poisson([[[154]], [[156]]], (2, 32, 32)), 255)
+    known = {"kind": ["dark", *["flat"] * 7], "white_level": 255, "shutter": "global"}
+    counts = [of.astype(np.uint16) for of in (100 + rng.poisson(4, (2, 32, 32)), *straight)]
+    stack = hsnoise.FrameStack([da.from_array(of) for of in counts], [1.0, *exposures_s], **known)  # checked when read
+    with pytest.raises(ValueError, match="reach white_level"):
+        list(stack.frames(7))
+    model = model_of(*BASE)
+    assert with_response(model, stack) is with_response(model, stack.select(exposures=range(7))) is model
+
+
+@pytest.mark.usefixtures("few_candidates")
+def test_a_story_is_kept_if_its_model_cannot_be_closed(monkeypatch):
+    def fails(*of, **keywords):
+        raise ValueError("this sensor has no maps")
+
+    monkeypatch.setattr(importlib.import_module("hsnoise.criticism.improve"), "closed", fails)
+    seen, _ = wild_sensor(shape=(64, 80))
+    story = hsnoise.improve(seen, max_steps=0, close=True)
+    assert story.closed is None and story.steps
+    assert story.left_open == "Not closed with measured components: this sensor has no maps."
 
 
 def test_shares_add_up():
