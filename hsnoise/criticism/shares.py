@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from hsnoise._core.keys import named_key
 from hsnoise._core.threads import in_threads
@@ -21,7 +21,8 @@ from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.statistics.decomposition import COMPONENTS, STATIC, Component, decomposed, mean_of
 
-DRAWS = 4  # of each model
+DRAWS, MORE = 4, 16  # of each model; where they scatter more than lines and pixels by themselves
+EXCESS = 0.01  # probability in a capture that they seem to
 CLEAR = 2.0  # standard errors, below which a difference is chance
 IN_WORDS = {
     "frame": "offsets of frames",
@@ -116,14 +117,32 @@ def shares_of(
     before: for each exposure, how many frames of the series come before these; default: none. Raises ValueError for an
     exposure of one frame.
     """
-    drawn = {"named": _drawn(named, frames, named_key(key, "named"), before)}
-    drawn["closed"] = drawn["named"] if closed is None else _drawn(closed, frames, named_key(key, "closed"), before)
+    whole, own = (named, named_key(key, "named")) if closed is None else (closed, named_key(key, "closed"))
+    drawn = {"closed": _drawn(whole, frames, own, before)}
+    drawn["named"] = drawn["closed"] if closed is None else _drawn(named, frames, named_key(key, "named"), before)
+    if _scatter_beyond(drawn["closed"], same_pixels=closed is not None):
+        drawn["closed"] = drawn["closed"] + _drawn(whole, frames, own, before, range(DRAWS, MORE))
     found = []
     for (i, channel), measured in _components(frames).items():
         parts = {name: [one[i, channel] for one in of] for name, of in drawn.items()}
         at = float(frames.exposure_s[i]), channel
         found += _shares(*at, measured, parts["named"], parts["closed"], same_pixels=closed is not None)
     return tuple(found)
+
+
+def _scatter_beyond(drawn: list[dict[Place, Components]], *, same_pixels: bool) -> bool:
+    """Whether a component scatters more from draw to draw than its lines or pixels do by themselves.
+
+    A band whose phase is new in each frame scatters as a whole. Four draws show that it does, but not by how much.
+    """
+    ratios = [
+        np.var([of[place][name].variance_dn2 for of in drawn], ddof=1) / error**2
+        for place in drawn[0]
+        for name in COMPONENTS
+        if (error := _error(name, drawn[0][place][name], same_pixels)) > 0
+    ]
+    dof = len(drawn) - 1
+    return max(ratios, default=0.0) > chi2.isf(EXCESS / len(ratios), dof) / dof
 
 
 Components = Mapping[str, Component]
@@ -144,10 +163,8 @@ def _shares(
         own = _error(name, one, same_pixels)
         of_draws = float(np.mean([_error(name, drawn[name], same_pixels) for drawn in closed]))
         # The error of what came out low by chance is too small, that of the model too large if it draws too much.
-        error = np.hypot(max(own, np.sqrt(own * of_draws)), of_draws / np.sqrt(DRAWS))
-        # A band whose phase is random in each frame scatters as a whole, not line by line.
-        scatter = np.std([drawn[name].variance_dn2 for drawn in closed], ddof=1) * np.sqrt(1 + 1 / DRAWS)
-        error = max(error, scatter)
+        error = np.hypot(max(own, np.sqrt(own * of_draws)), of_draws / np.sqrt(len(closed)))
+        error = max(error, _error_by_draws(one.variance_dn2, np.array([drawn[name].variance_dn2 for drawn in closed])))
         whole, by_names = (_mean(name, of) for of in (closed, named))
         yield Share(exposure_s, channel, name, one.variance_dn2, float(error), whole, by_names, max(total, 1e-300))
 
@@ -189,10 +206,14 @@ def static_dn2(frames: FrameStack) -> float:
 
 
 def _drawn(
-    model: NoiseModel, like: FrameStack, key: RandomKey, before: Sequence[int] = ()
+    model: NoiseModel,
+    like: FrameStack,
+    key: RandomKey,
+    before: Sequence[int] = (),
+    numbers: Sequence[int] = range(DRAWS),
 ) -> list[dict[Place, Components]]:
     return in_threads(
-        lambda number: _components(draw_capture(jax.random.fold_in(key, number), model, like, before)), range(DRAWS)
+        lambda number: _components(draw_capture(jax.random.fold_in(key, number), model, like, before)), numbers
     )
 
 
@@ -202,6 +223,24 @@ def _static(found: list[dict[Place, Components]]) -> float:
 
 def _mean(name: str, of: list[Components]) -> float:
     return float(np.mean([one[name].variance_dn2 for one in of]))
+
+
+def _error_by_draws(measured: float, drawn: np.ndarray) -> float:
+    """Standard error of the difference between a measured variance and those of draws, by how these scatter.
+
+    Variances of few independent parts are chi-square, whose lower tail is thin and whose upper one is long: the error
+    is that with which their cube roots are as far apart (Wilson and Hilferty, PNAS 17, 1931), wider where the farthest
+    draw lies farther out than of a chi-square, as with a band that has one phase in two frames, or two opposite ones.
+    """
+    n, mean = len(drawn), float(drawn.mean())
+    scatter = float(drawn.std(ddof=1) * np.sqrt(1 + 1 / n))
+    if scatter >= mean or scatter == 0:  # next to nothing is drawn, or in less than two parts
+        return scatter
+    width = (scatter / mean / 3) ** 2
+    z = (np.cbrt(np.maximum([measured, *drawn], 0.0) / mean) - 1 + width) / np.sqrt(width)
+    farthest = norm.isf((1 - 0.5 ** (1 / n)) / 2)  # of n normal numbers, the median
+    wider = max(1.0, float(np.abs(z[1:]).max() / farthest))
+    return abs(measured - mean) / abs(z[0]) * wider if z[0] else scatter
 
 
 def _error(name: str, of: Component, same_pixels: bool) -> float:

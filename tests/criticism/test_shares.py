@@ -66,6 +66,21 @@ def test_a_band_of_random_phases_leaves_no_pattern_beyond_chance(seed):
     assert largest_unexplained(of) is None
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_two_frames_in_which_a_band_has_one_phase_are_chance(seed):
+    """Of ten exposures, some pairs have: four draws do not tell how far that moves noise into the static pattern."""
+    exposures_s = tuple(np.linspace(0.01, 0.02, 10))
+    base = [fx.ShotNoise(), fx.DarkCurrent(10.0), fx.ReadNoise(4.0), fx.Gain(2.0), fx.BlackLevel(64.0), fx.ADC()]
+    model = hsnoise.NoiseModel(base, cfa="mono", shutter="global", exposure_s=0.02)
+    model = model.add(fx.PeriodicBanding(4.0, 0.31, axis="column"))
+    of = [
+        np.asarray(hsnoise.sample_dark(100 * seed + i, 2, (64, 96), model, exposure_s=t))
+        for i, t in enumerate(exposures_s)
+    ]
+    found = shares_of(model, hsnoise.FrameStack(of, exposures_s, shutter="global"), jax.random.key(seed))
+    assert largest_unexplained(found) is None
+
+
 def test_noise_that_is_not_there_is_too_much():
     found = hsnoise.compare(CAMERA.add(fx.FrameOffset(4.0)), capture(CAMERA, frames=24), draws=16)
     assert found.largest_unexplained.component == "frame" and "the model adds" in found.unexplained
