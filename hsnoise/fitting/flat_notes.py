@@ -7,14 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from hsnoise._core.types import StatedGain
+from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.pixel_response import STRAIGHT, Bend
 from hsnoise.fitting.result import FitResult
 from hsnoise.likelihood.darks import flat_gain_of
 from hsnoise.likelihood.flat_gain import LINE_RANGE, FlatGain, variance_curve
 from hsnoise.likelihood.flats import FlatMoments
+from hsnoise.statistics.pixels.transfer import Transfer
 
 FALLING_BLACK = 0.005  # of the signal, by which the overscan differs from darks
 BLACK_SIGMAS = 5.0
+TOLD = 0.1  # relative error of the gain that darks tell, below which flats of one level are not alone
 WRONG, WRONG_SIGMAS = 0.08, 3.0  # of a stated gain: relative difference, standard errors
 
 
@@ -37,8 +40,9 @@ def flat_doubts(result: FitResult) -> list[str]:
     doubts = scattered(found, channels)
     if pixel is None or not pixel.determined or pixel.channels[0].register is not None:
         return doubts
+    doubts += _lone_level(found, pixel, channels)
     if all(one.transfer is None for one in pixel.channels):  # darks of one exposure tell no gain
-        return doubts + _lone_level(found, channels)
+        return doubts
     gain = np.broadcast_to(np.asarray(result.params["gain"].value), len(channels))
     return doubts + _contradicted(found, flats, gain, channels)
 
@@ -49,8 +53,7 @@ def gain_notes(
     """Notes on the gain from flats; bends: what bends the curve of each channel, where pixels were followed."""
     notes = list(flats.set_aside)
     for c, channel in enumerate(channels):
-        for note in (_undetermined, _left_out):
-            notes += note(found, c, _of(channel))
+        notes += _undetermined(found, flats, c, _of(channel)) + _left_out(found, c, _of(channel))
         notes += _bent(found, c, _of(channel), STRAIGHT if bends is None else bends[c])
     return notes + scattered(found, channels) + _falling_black(found, flats)
 
@@ -60,16 +63,21 @@ def scattered(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
     return [note for c, channel in enumerate(channels) for note in _scattered(found, c, _of(channel))]
 
 
-def _lone_level(found: FlatGain, channels: tuple[str, ...]) -> list[str]:
+def _lone_level(found: FlatGain, pixel: PixelFit, channels: tuple[str, ...]) -> list[str]:
     """A sentence if one level alone determines the gain; darks that tell it would show whether it is right."""
-    lone = [c for c in range(len(channels)) if found.used[:, c].sum() == 1]
+    lone = [c for c in range(len(channels)) if found.used[:, c].sum() == 1 and not _told(pixel.channels[c].transfer)]
     if not lone:
         return []
     of = _of(channels[lone[0]]) if len(lone) < len(channels) else ""
     return [
         f"One level of flats{of} determines the gain, and nothing shows whether the response bends or saturates there:"
-        " two or more levels, or dark exposures of several lengths, would."
+        " two or more levels, or dark exposures whose signal grows, would."
     ]
+
+
+def _told(darks: Transfer | None) -> bool:
+    """Whether darks tell the gain well enough to contradict flats."""
+    return darks is not None and darks.gain_error < TOLD * darks.gain
 
 
 def _contradicted(found: FlatGain, flats: FlatMoments, gain: np.ndarray, channels: tuple[str, ...]) -> list[str]:
@@ -93,9 +101,11 @@ def _of(channel: str) -> str:
     return "" if channel == "mono" else f" of channel {channel}"
 
 
-def _undetermined(found: FlatGain, c: int, of: str) -> list[str]:
+def _undetermined(found: FlatGain, flats: FlatMoments, c: int, of: str) -> list[str]:
     if np.isfinite(found.gain[c]):
         return []
+    if np.isnan(flats.dark_variance_dn2[:, c]).all():
+        return [f"The flats{of} do not determine the gain: there are no darks that tell level and noise without light."]
     return [f"No flat level{of} has a variance above that of the darks: the flats do not determine the gain."]
 
 

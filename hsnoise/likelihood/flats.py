@@ -17,6 +17,7 @@ import equinox as eqx
 import numpy as np
 import scipy  # its parts are imported when they are used
 
+from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.bayer import channel_rows
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.flat_pairs import Shot, pairs_of_singles
@@ -286,6 +287,7 @@ def _measure(
     for n, c in enumerate(stack.channels):
         if dark is not None:
             _check_same_light(list(totals[c].row_means.mean(1)), stack, shots)
+            _check_no_copies(totals[c], stack, shots)
         zero = totals[c].row_means.mean() if dark is None else float(np.mean([black[s.group][n] for s in shots]))
         read = 0.0 if dark is None else float(np.nan_to_num(dark.variance_dn2[n]))
         columns.append(_moments(totals[c], zero, read, stack.white_level, dark is None))
@@ -311,6 +313,16 @@ def _check_same_light(levels: list[float], stack: FrameStack, shots: list[Shot])
             f" {min(levels):.4g} to {max(levels):.4g} DN; a group holds frames of the same light, so give each"
             " brightness its own group (its own array, or its own exposure_s)"
         )
+
+
+def _check_no_copies(sums: _Sums, stack: FrameStack, shots: list[Shot]) -> None:
+    """Frames of one level must differ, unless most of their pixels are saturated."""
+    if sums.at_highest > FEWEST_PIXELS * sums.relative.size * len(shots):
+        return
+    groups = dict.fromkeys(shot.group for shot in shots)
+    rows = iter(sums.row_means)  # in the order in which frames were read
+    prints = [[next(rows).tobytes() for shot in shots if shot.group == group] for group in groups]
+    check_no_copies(prints, [float(stack.exposure_s[group]) for group in groups])
 
 
 def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | None, is_dark: bool) -> tuple:

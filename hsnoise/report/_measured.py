@@ -14,7 +14,7 @@ from hsnoise.frames.bayer import channel_pixels, channel_planes
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import check_fits, draw_capture
-from hsnoise.simulation.portion import Portion, middle_of
+from hsnoise.simulation.portion import Portion, is_saturated, middle_of
 
 DRAWS = 4
 SEED_APART = 9000  # so that the draws shown differ from those of the comparison
@@ -74,7 +74,7 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = F
 
 
 def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shortest: bool = False) -> Middle:
-    """The dark exposure that is shown, the brightest flat, and, for mono sensors, the other extreme dark."""
+    """The dark exposure that is shown, the brightest flat below saturation and, of mono sensors, the other extreme dark."""
     measured = _middle(stack, shortest)
     return Middle(measured, tuple(in_threads(lambda model: draw_capture(seed + SEED_APART, model, measured), models)))
 
@@ -88,7 +88,8 @@ def _darks(stack: FrameStack) -> FrameStack:
 def _middle(stack: FrameStack, shortest: bool) -> FrameStack:
     """The part of `stack` that `middle` shows, in memory."""
     darks = [i for i, kind in enumerate(stack.kind) if kind == "dark"]
-    flats = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
+    repeated = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] > 1]
+    flats = [i for i in repeated if not is_saturated(stack, i)]
     by_length = sorted(darks, key=lambda i: float(stack.exposure_s[i]), reverse=not shortest)
     chosen = [by_length[0], *sorted(flats, key=lambda i: -float(stack.frame(i, 0).mean()))[:1]]
     if by_length[-1] not in chosen and (stack.cfa == "mono" or stack.n_frames[chosen[0]] == 1):

@@ -44,6 +44,9 @@ def _coupled(shared: tuple[float, float]) -> Iterator[str]:
 
 
 def _memory(found: Survey) -> Memory | None:
-    """What pixels keep of the frame before, in all darks: light may differ from frame to frame."""
-    wide = [group for group in found.repeated_darks if group.noise_dn > LEAST_NOISE_DN]
-    return together([p.halves.memory for group in wide for p in group.planes if p.halves.memory is not None])
+    """What pixels keep of the frame before, in darks or, if it is more, in flats: image lag is in electrons alone."""
+    told = []
+    for groups in (found.repeated_darks, found.repeated_flats):
+        wide = [group for group in groups if group.noise_dn > LEAST_NOISE_DN]
+        told.append(together([p.halves.memory for group in wide for p in group.planes if p.halves.memory is not None]))
+    return max((one for one in told if one is not None), key=lambda one: one.share, default=None)

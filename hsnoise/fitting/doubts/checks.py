@@ -30,6 +30,7 @@ from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
+from hsnoise.statistics.pixels.companding import companded
 from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart
 from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
 from hsnoise.statistics.pixels.survey import Survey
@@ -83,6 +84,7 @@ def checked(result: FitResult, seen: Evidence) -> FitResult:
         *curves(result),
         *gains_differ(result, found),
         *flat_doubts(result),
+        *companded(found),
     )
     doubts = tuple(dict.fromkeys([*odd, *open_gain, *grave, *minor]))  # first what makes all others pointless
     is_wrong = bool(grave) or share > MOST_OUTLIERS
