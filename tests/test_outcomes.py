@@ -22,6 +22,7 @@ READING = {
 # What others wrote has to be read: modules (or folders) and what they read.
 READERS = {
     "_core/parsing.py": "words of the command line",
+    "cli/compiled.py": "what Linux says of the processor",
     "cli/main.py": "errors of other libraries, put on one line",
     "effects/_base.py": "docstrings, those of users' effects too",
     "enhance/training/clips.py": "names of users' files",

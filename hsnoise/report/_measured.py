@@ -74,7 +74,7 @@ def shown(stack: FrameStack, model: NoiseModel, seed: int, *, shortest: bool = F
 
 
 def middle(stack: FrameStack, models: Sequence[NoiseModel], seed: int, *, shortest: bool = False) -> Middle:
-    """The dark exposure that is shown, the brightest flat below saturation and, of mono sensors, the other extreme dark."""
+    """The dark exposure shown, the brightest flat below saturation and, of mono sensors, the other extreme dark."""
     measured = _middle(stack, shortest)
     return Middle(measured, tuple(in_threads(lambda model: draw_capture(seed + SEED_APART, model, measured), models)))
 

@@ -101,10 +101,13 @@ def _spread_below(variance: np.ndarray, dof: int) -> float:
 def _of_their_level(level: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Typical variance of pixels of a level [pixel]: of classes the mean below the 90 % quantile, interpolated.
 
-    Pixels brighter than the last class that has enough of them follow the growth up to it, as shot noise does.
+    The brightest pixels are one class, if they are few. Brighter ones than its mean follow the growth up to it, as shot
+    noise does.
     """
     edges = np.unique(np.quantile(level, np.concatenate([[0, 0.5, 0.9], 1 - np.geomspace(0.05, 1e-4, 10)])))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, len(edges) - 1)
+    from_here_on = np.cumsum(np.bincount(number)[::-1])[::-1]
+    number = np.minimum(number, np.flatnonzero(from_here_on > FEWEST).max(initial=0))
     classes = [number == i for i in range(len(edges))]
     classes = [inside for inside in classes if np.count_nonzero(inside) > FEWEST]
     if not classes:
