@@ -18,7 +18,8 @@ LIT_DN, LIT_NOISES = 50.0, 3.0  # signal that may be light, in DN and in a pixel
 LEAST_SPREAD, MOST_SPREAD = 0.002, 0.15  # relative, of that signal over pixels: less is simulated, more is dark current
 SMOOTHED = 0.1  # share of the noise that neighbouring pixels have in common
 LIT = 1.0  # in units of a pixel's noise: a larger shift of a frame is not a wandering black level
-HOT_NOISES, FEWEST_HOT, SWAPPED = 10.0, 8, 0.7  # of a pixel's noise; pixels; ratio of their signals
+HOT_NOISES, STILL_NOISES, FEWEST_HOT = 10.0, 3.0, 8  # signal over a pixel's noise: once, and again; pixels
+LONGER, SWAPPED, WIDE_DN = 1.5, 0.7, 0.5  # ratios of exposures and of signals; noise, where levels are no codes
 FEWEST = 3  # frames among which an odd one can be found
 TWO_DN, TWO_SHARE = (
     50.0,
@@ -34,9 +35,10 @@ def oddities_of(found: Survey) -> tuple[str, ...]:
 
 def _swapped(found: Survey) -> Iterator[str]:
     """Exposures of which hot pixels say that the shorter one is the longer."""
-    darks = sorted(found.repeated_darks, key=lambda group: group.exposure_s)
+    wide = [group for group in found.repeated_darks if group.noise_dn > WIDE_DN]
+    darks = sorted(wide, key=lambda group: group.exposure_s)
     for short, long in zip(darks, darks[1:], strict=False):
-        if short.exposure_s < long.exposure_s and (growth := _hot_growth(short, long)) < SWAPPED:
+        if long.exposure_s > LONGER * short.exposure_s and (growth := _hot_growth(short, long)) < SWAPPED:
             yield (
                 f"Hot pixels of the {name_of(long)} have {growth:.0%} of the signal that they have at"
                 f" {short.exposure_s:g} s: are the exposures swapped?"
@@ -44,11 +46,12 @@ def _swapped(found: Survey) -> Iterator[str]:
 
 
 def _hot_growth(short: Group, long: Group) -> float:
-    """Signal of hot pixels in longer darks over that in shorter ones, the median; NaN with too few hot pixels."""
+    """Signal of hot pixels in longer darks over that in shorter ones, the median; NaN with too few pixels hot in both."""
     ratios = []
     for one, other in zip(short.planes, long.planes, strict=True):
         a, b = (plane.halves.level_dn.mean(0) - np.median(plane.halves.level_dn) for plane in (one, other))
         hot = np.minimum(*one.halves.level_dn) - np.median(one.halves.level_dn) > HOT_NOISES * short.noise_dn
+        hot &= b > STILL_NOISES * long.noise_dn
         ratios.append(b[hot] / a[hot])
     of_all = np.concatenate(ratios)
     return float(np.median(of_all)) if len(of_all) >= FEWEST_HOT else float("nan")
