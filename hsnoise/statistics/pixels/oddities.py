@@ -46,7 +46,7 @@ def _swapped(found: Survey) -> Iterator[str]:
 
 
 def _hot_growth(short: Group, long: Group) -> float:
-    """Signal of hot pixels in longer darks over that in shorter ones, the median; NaN with too few pixels hot in both."""
+    """Signal of hot pixels in longer darks over that in shorter ones, the median; NaN if few are hot in both."""
     ratios = []
     for one, other in zip(short.planes, long.planes, strict=True):
         a, b = (plane.halves.level_dn.mean(0) - np.median(plane.halves.level_dn) for plane in (one, other))
