@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hsnoise
+from hsnoise.likelihood.flat_gain import flat_gain
 
 GAIN, BLACK_DN, NOISE_E, SHAPE = 0.8, 200.0, 3.0, (96, 128)
 EXPOSURES_S, LIGHT_E = (1.0, 4.0, 16.0), (600, 1500, 3000)
@@ -101,3 +104,15 @@ def test_compressed_counts_are_told(step, told):
     of = [compressed(read(electrons(light, 4, 40 + i), 50 + i)) for i, light in enumerate(LIGHT_E)]
     fit = hsnoise.fit(stack(of))
     assert any("compresses its counts" in doubt for doubt in fit.doubts) is told
+
+
+def test_levels_that_agree_by_chance_have_the_error_of_chance():
+    """Of EMVA 1288's line, which stands in where no curve describes the levels."""
+    flats_of = hsnoise.summarise(stack(flats((600, 1200, 2000)))).flats
+    signal = flats_of.mean_dn - flats_of.dark_dn
+    exact = flats_of.dark_variance_dn2 + GAIN * signal * np.array([[1.0], [1.0], [1.3]])
+    found = flat_gain(replace(flats_of, variance_dn2=exact, row_power_dn2=0 * exact))
+    assert not found.described[0] and found.used[:, 0].tolist() == [True, True, False]
+    assert found.gain[0] == pytest.approx(GAIN, rel=1e-6)
+    by_chance = 1 / np.sqrt(np.sum(1 / found.level_error[:2, 0] ** 2))
+    assert found.standard_error[0] == pytest.approx(by_chance, rel=0.01)

@@ -138,7 +138,7 @@ def _of_channel(flats: FlatMoments, c: int, black, read, read_error):
         n = max(int((levels.signal <= LINE_RANGE * full_scale).sum()), min(len(order), 2))
         gain, standard_error = _line(levels, n)
         by_chance = 1 / np.sqrt(np.sum((levels.signal[:n] / levels.error[:n]) ** 2))
-        standard_error = max(standard_error, by_chance * curve.scale)  # two levels may agree by chance
+        standard_error = np.hypot(standard_error, by_chance)  # two levels may agree by chance
         curve = curve._replace(coefficients=curve.coefficients[:1])
         share = levels.signal[:n] ** 2
     bend, bend_error = np.zeros(MOST_DEGREES), np.zeros(MOST_DEGREES)
