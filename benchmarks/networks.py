@@ -9,7 +9,8 @@ three, each tried for a sixth of that time and judged on the split's validation 
 tested. Each has the loss of its paper (the ST-LSTM's without the perceptual term). Networks with a window are trained
 on those of the 8 frames of a piece that have one (FFDNet 8, FastDVDnet 4, TOFlow 2, KPN 1), and tested on all frames of
 a video that is reflected at its ends: unlike the ST-LSTM they also see later frames. `--untrained` adds methods that
-need no training, tuned on the first validation clip, and the input itself. Outputs are scored as they are, and scaled
+need no training, tuned on the first validation clip, and the input itself; `--weights` a network of `hsnoise train`,
+such as those that come with hsnoise. Outputs are scored as they are, and scaled
 in brightness to the truth. Finished trainings and scores are kept in `--out`; the same command resumes. `--noise
 gaussian` trains with simpler noise of the same strength; tests have the camera's. Tables, scores of each frame
 (networks.csv), their curves (networks.png) and the last frame of each clip (CLIP.png) show all methods that `--out` has
@@ -19,6 +20,7 @@ for the same training, light and clips, those of earlier commands, too.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import time
@@ -47,7 +49,7 @@ from hsnoise._core.output import write_atomically, write_figure
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
-from hsnoise.enhance.training.evaluate import Method, prepared
+from hsnoise.enhance.training.evaluate import Method, check_weights, prepared
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of, noise_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
 from hsnoise.enhance.training.rivals import Denoiser, rivals
@@ -56,11 +58,11 @@ from hsnoise.enhance.training.split import split_of
 from hsnoise.enhance.training.steps import batch_rng, digest_of, examples
 from hsnoise.enhance.training.tables import REFER
 from hsnoise.enhance.training.validation import psnr_db
-from hsnoise.enhance.weights import read_arrays, write_arrays
+from hsnoise.enhance.weights import load_network, read_arrays, write_arrays
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, loss
 
-OURS = "ST-LSTM"
+OURS, WEIGHTS = "ST-LSTM", "weights"
 RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
 MINUTES = 10.0  # of a training
 RATES = (3e-4, 1e-3, 3e-3)
@@ -281,10 +283,17 @@ def measures(
             "frames": tested(lambda scene: np.asarray(display_from_linear(scene.noisy)), scenes, folders[1] / REFER)
         }
 
+    def of_weights() -> dict[str, Any]:
+        net = Ours(load_network(options.weights)[0])
+        return {"frames": tested(partial(_of_scene, net), scenes, folders[1] / WEIGHTS)}
+
     digests = setting.noise_digest, setting.digest
     found = [
         partial(keep, folders[0] / f"{name}{noise}.json", digests[0], of_network, name) for name in options.networks
     ]
+    if options.weights is not None:
+        of_file = f"{digests[1]}-{hashlib.sha256(options.weights.read_bytes()).hexdigest()[:8]}"
+        found.append(partial(keep, folders[1] / f"{WEIGHTS}.json", of_file, of_weights))
     if options.untrained:
         found.append(partial(keep, folders[1] / f"{REFER}.json", digests[1], of_input))
         for name, denoise in rivals().items():
@@ -323,12 +332,15 @@ def write_figures(of_methods: dict[str, Path], scenes: Sequence[Scene], ours: st
 def run(options: argparse.Namespace) -> None:
     """Train, score and write the tables. Raises ValueError as `setting_of`."""
     setting, test = setting_of(options)
+    if options.weights is not None:
+        check_weights(options.weights, *load_network(options.weights), setting.camera, test)
     tasks = [(clip, float(level)) for clip in test for level in np.geomspace(*setting.camera.mean_e, LEVELS)]
     scenes = [
         scene_of(clip, setting.camera, level, options.crop, 1000 + number, TESTED_FRAMES)
         for number, (clip, level) in enumerate(tasks)
     ]
-    (folders, found), ours = measures(setting, scenes, options), OURS + suffix_of(options.noise)
+    folders, found = measures(setting, scenes, options)
+    ours = OURS + suffix_of(options.noise) if options.weights is None else WEIGHTS
     for measure in found:
         measure()
         of_methods, sheets = write_tables(folders, ours, options.out)
@@ -360,13 +372,14 @@ def main(argv: list[str] | None = None) -> None:
     add("--crop", type=int, default=128, help="side of the tested middle of each frame, pixels (default: 128)")
     add("--networks", nargs="*", default=names, choices=names, help="default: all")
     add("--untrained", action="store_true", help="non-local means, total variation, and BM3D, BM4D if installed, too")
+    add("--weights", type=Path, help="weights.eqx of `hsnoise train`, scored beside the others")
     add("--out", type=Path, default=Path("build/networks"), help="default: build/networks")
     options = parser.parse_args(argv)
     for option in ("minutes", "steps"):
         if (value := getattr(options, option)) is not None and not 0 < value < math.inf:
             parser.error(f"--{option}: expected more than 0, got {value:g}")
-    if not (options.networks or options.untrained):
-        parser.error("--networks: expected a network at least, or --untrained")
+    if not (options.networks or options.untrained or options.weights):
+        parser.error("--networks: expected a network at least, --weights or --untrained")
     if min(options.rates) <= 0:
         parser.error(f"--rates: expected above 0, got {options.rates}")
     if options.width <= 0 or options.crop < SIDE or options.batch < 1:
@@ -376,7 +389,7 @@ def main(argv: list[str] | None = None) -> None:
         )
     try:
         run(options)
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
         parser.exit(130, "Interrupted; the same command resumes\n")

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 import optax
 import pytest
 
+import hsnoise
 from benchmarks._network_scores import tables
 from benchmarks.networks import OURS, RIVALS, Budget, main
 from benchmarks.rivals.fastdvdnet import STRIDE
@@ -249,7 +251,7 @@ def test_width_must_be_positive():
     [
         (["--steps", "0"], "--steps: expected more than 0, got 0"),
         (["--minutes", "nan"], "--minutes: expected more than 0, got nan"),
-        (["--networks"], "--networks: expected a network at least, or --untrained"),
+        (["--networks"], "--networks: expected a network at least, --weights or --untrained"),
         (["--crop", "32"], "at least 64, got 0.25, 4, 32"),
         (["--rates", "-1"], "--rates: expected above 0, got [-1.0]"),
         ([], "--clips: expected a folder"),
@@ -290,3 +292,7 @@ def test_the_command_trains_scores_and_keeps_what_is_finished(tmp_path, capsys):
     table = (out / "networks.md").read_text()
     assert "| FFDNet, gaussian noise |" in table and "| FFDNet |" in table  # those of earlier commands, too
     assert len((out / "networks.csv").read_text().splitlines()) == 1 + 2 * 5 * 8
+    shipped = Path(hsnoise.__file__).parent / "enhance" / "data" / "enhancer_canon_5d3.eqx"
+    main([*command, "--weights", str(shipped)])
+    table = (out / "networks.md").read_text()
+    assert "| weights |" in table and "| weights - FFDNet |" in table
