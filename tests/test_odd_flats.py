@@ -67,7 +67,7 @@ def test_one_level_is_doubted_where_darks_tell_no_gain():
 def test_copies_are_refused():
     of = flats()
     of[1][2] = of[1][0]
-    with pytest.raises(ValueError, match="frames 0 and 2 of the 1 s exposure are identical"):
+    with pytest.raises(ValueError, match="flats: frames 0 and 2 of the 1 s exposure are identical"):
         hsnoise.fit(stack(of))
 
 

@@ -17,8 +17,8 @@ from hsnoise.frames.lazy import LazyFrames, is_dask
 KINDS = ("dark", "flat")
 
 
-def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[float]) -> None:
-    """Raise ValueError if two frames are identical, judged by their `prints` [exposure, frame]."""
+def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[float], name: str = "counts") -> None:
+    """Raise ValueError if two frames are identical, judged by their `prints` [exposure, frame]; name: what they are."""
     seen: dict[bytes, tuple[int, float]] = {}
     for of_exposure, seconds in zip(prints, exposure_s, strict=True):
         for number, one in enumerate(of_exposure):
@@ -30,7 +30,7 @@ def check_no_copies(prints: Iterable[Iterable[bytes]], exposure_s: Iterable[floa
                     else f"frame {first} of the {earlier:g} s exposure and frame {number} of the {seconds:g} s exposure"
                 )
                 raise ValueError(
-                    f"counts: {which} are identical; copies hold no information on noise, so give each frame once"
+                    f"{name}: {which} are identical; copies hold no information on noise, so give each frame once"
                 )
             seen[one] = number, seconds
 

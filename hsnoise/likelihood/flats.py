@@ -322,7 +322,7 @@ def _check_no_copies(sums: _Sums, stack: FrameStack, shots: list[Shot]) -> None:
     groups = dict.fromkeys(shot.group for shot in shots)
     rows = iter(sums.row_means)  # in the order in which frames were read
     prints = [[next(rows).tobytes() for shot in shots if shot.group == group] for group in groups]
-    check_no_copies(prints, [float(stack.exposure_s[group]) for group in groups])
+    check_no_copies(prints, [float(stack.exposure_s[group]) for group in groups], "flats")
 
 
 def _moments(sums: _Sums, zero_dn: float, read_dn2: float, white_level: float | None, is_dark: bool) -> tuple:
