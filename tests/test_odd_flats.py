@@ -59,6 +59,14 @@ def test_without_a_fault_there_is_no_doubt():
     assert not fit.doubts and abs(gain_of(fit)[0] - GAIN) < 4 * gain_of(fit)[1]
 
 
+def test_a_hot_pixel_is_no_column_far_off(monkeypatch):
+    """Although it pulls the mean of its column."""
+    one_hot = np.full(SHAPE, 0.02)
+    one_hot[30, 70] = 200.0
+    monkeypatch.setitem(globals(), "hot_e", lambda: one_hot)
+    assert not any("far off" in note for note in hsnoise.fit(stack(flats())).notes)
+
+
 def test_one_level_is_doubted_where_darks_tell_no_gain():
     fit = hsnoise.fit(stack(flats(LIGHT_E[1:2])))
     assert any("nothing shows whether the response bends" in doubt for doubt in fit.doubts)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from hsnoise._core.coloured import EXPONENTS, exponent_of, fading_power
 from hsnoise.fitting.pixel_rows import LEAST_ERROR, widened
@@ -16,6 +17,7 @@ FEWEST_LINES = 32  # for a difference of even and odd ones
 FEW = 0.05  # share of lines with a defect; of more, levels have two or three values, as bands leave them
 EFFICIENCY = 2 / 3  # of differences of neighbours, which overlap
 PARITY_THERE = 4.0  # errors of a difference of even and odd lines
+AROUND, WHOLE = 9, 0.5  # lines with which one is compared; share of its level that its median pixel must show
 ALIKE, BEYOND_CHANCE = 0.5, 5.0  # share of the variance, and its errors, that neighbours have in common
 
 
@@ -68,7 +70,7 @@ def lines_of(
     if shared > BEYOND_CHANCE * sigma and variance > noise:
         exponent = _exponent(shared / (variance - noise), sigma / (variance - noise), step * len(rest[0]), step)
         error *= widened(np.array(fading_power(step * len(rest[0]), np.float32(exponent[0])), float))
-    far = [np.abs(of[~there]) for of, there in zip(rest, near, strict=True)]
+    far = [np.abs(of[~there & _is_whole(plane, axis, of)]) for plane, of, there in zip(planes, rest, near, strict=True)]
     farthest = max((float(of.max()) for of in far if len(of)), default=0.0)
     several = sum(map(len, far)), farthest
     return Lines(variance - noise, float(error), beside - noise, bool(follow), exponent, *several, parity)
@@ -101,6 +103,18 @@ def _exponent(correlation: float, error: float, lines: int, step: int) -> tuple[
 def _near(rest_dn: np.ndarray) -> np.ndarray:
     near = np.abs(rest_dn) <= FAR * _typical_dn(rest_dn)
     return near if near.mean() >= 1 - FEW else np.ones_like(near)
+
+
+def _is_whole(plane: Plane, axis: str, rest_dn: np.ndarray) -> np.ndarray:
+    """Which lines [line] are off as a whole: the median of their pixels is, and not only a hot or a stuck one."""
+    level = plane.halves.level_dn.mean(0).reshape(-1, len(plane.column_mean_dn))
+    lines = level if axis == "row" else level.T
+    if len(lines) != len(rest_dn):  # rows of which only some were sampled
+        return np.ones(len(rest_dn), bool)
+    middle = np.median(lines, axis=1)
+    others = median_filter(middle, AROUND, mode="nearest"), np.median(middle)  # a drift ends in several lines
+    off = np.maximum(*((middle - of) * np.sign(rest_dn) for of in others))
+    return off > WHOLE * np.abs(rest_dn)
 
 
 def _rest(means_dn: np.ndarray, shading: Shading | None) -> np.ndarray:
