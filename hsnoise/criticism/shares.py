@@ -142,7 +142,7 @@ def _scatter_beyond(drawn: list[dict[Place, Components]], *, same_pixels: bool) 
         if (error := _error(name, drawn[0][place][name], same_pixels)) > 0
     ]
     dof = len(drawn) - 1
-    return max(ratios, default=0.0) > chi2.isf(EXCESS / len(ratios), dof) / dof
+    return max(ratios, default=0.0) > chi2.isf(EXCESS / max(len(ratios), 1), dof) / dof
 
 
 Components = Mapping[str, Component]
