@@ -120,13 +120,26 @@ def shares_of(
     whole, own = (named, named_key(key, "named")) if closed is None else (closed, named_key(key, "closed"))
     drawn = {"closed": _drawn(whole, frames, own, before)}
     drawn["named"] = drawn["closed"] if closed is None else _drawn(named, frames, named_key(key, "named"), before)
-    if _scatter_beyond(drawn["closed"], same_pixels=closed is not None):
-        drawn["closed"] = drawn["closed"] + _drawn(whole, frames, own, before, range(DRAWS, MORE))
-    found = []
-    for (i, channel), measured in _components(frames).items():
+    measured, same_pixels = _components(frames), closed is not None
+    found = _found(measured, frames, drawn, same_pixels=same_pixels)
+    if largest_unexplained(found) is None or not _scatter_beyond(drawn["closed"], same_pixels=same_pixels):
+        return found
+    drawn["closed"] = drawn["closed"] + _drawn(whole, frames, own, before, range(DRAWS, MORE))
+    return _found(measured, frames, drawn, same_pixels=same_pixels)
+
+
+def _found(
+    measured: Mapping[Place, Components],
+    frames: FrameStack,
+    drawn: Mapping[str, list[dict[Place, Components]]],
+    *,
+    same_pixels: bool,
+) -> tuple[Share, ...]:
+    found: list[Share] = []
+    for (i, channel), of_frames in measured.items():
         parts = {name: [one[i, channel] for one in of] for name, of in drawn.items()}
         at = float(frames.exposure_s[i]), channel
-        found += _shares(*at, measured, parts["named"], parts["closed"], same_pixels=closed is not None)
+        found += _shares(*at, of_frames, parts["named"], parts["closed"], same_pixels=same_pixels)
     return tuple(found)
 
 
