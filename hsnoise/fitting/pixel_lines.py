@@ -70,7 +70,8 @@ def lines_of(
     if shared > BEYOND_CHANCE * sigma and variance > noise:
         exponent = _exponent(shared / (variance - noise), sigma / (variance - noise), step * len(rest[0]), step)
         error *= widened(np.array(fading_power(step * len(rest[0]), np.float32(exponent[0])), float))
-    far = [np.abs(of[~there & _is_whole(plane, axis, of)]) for plane, of, there in zip(planes, rest, near, strict=True)]
+    off = [(plane, of, ~there) for plane, of, there in zip(planes, rest, near, strict=True) if not there.all()]
+    far = [np.abs(of[away & _is_whole(plane, axis, of)]) for plane, of, away in off]
     farthest = max((float(of.max()) for of in far if len(of)), default=0.0)
     several = sum(map(len, far)), farthest
     return Lines(variance - noise, float(error), beside - noise, bool(follow), exponent, *several, parity)
@@ -105,9 +106,14 @@ def _near(rest_dn: np.ndarray) -> np.ndarray:
     return near if near.mean() >= 1 - FEW else np.ones_like(near)
 
 
+def _level_dn(plane: Plane) -> np.ndarray:
+    """Levels of the sampled pixels [row, column]."""
+    return plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
+
+
 def _is_whole(plane: Plane, axis: str, rest_dn: np.ndarray) -> np.ndarray:
     """Which lines [line] are off as a whole: the median of their pixels is, and not only a hot or a stuck one."""
-    level = plane.halves.level_dn.mean(0).reshape(-1, len(plane.column_mean_dn))
+    level = _level_dn(plane)
     lines = level if axis == "row" else level.T
     if len(lines) != len(rest_dn):  # rows of which only some were sampled
         return np.ones(len(rest_dn), bool)
@@ -127,7 +133,7 @@ def _noise_dn2(plane: Plane, axis: str, frames: int) -> float:
 
     Outlying pixels, hot or stuck, do so in all lines but those few that they pull far off, which are left out.
     """
-    level = plane.halves.level_dn.mean(0, dtype=np.float64).reshape(-1, len(plane.column_mean_dn))
+    level = _level_dn(plane)
     level -= np.median(level, axis=0)
     level -= np.median(level, axis=1, keepdims=True)
     across = plane.row_mean_dn if axis == "column" else plane.column_mean_dn
