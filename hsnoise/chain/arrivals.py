@@ -36,6 +36,7 @@ class Arrivals(AbstractEffect):
 
     name: ClassVar[str] = "arrivals"
     stage: ClassVar[Stage] = Stage.PHOTONS
+    scaled_by: ClassVar[tuple[str, ...]] = ("read_noise_scale", "dark_current_scale")
     stream: ClassVar[str] = PIXELS
     rate: Scalar = param("e-/s", low=0)
     sigma: Scalar | None = None

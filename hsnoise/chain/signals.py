@@ -12,6 +12,7 @@ import numpy as np
 from hsnoise._core.keys import named_key
 from hsnoise.chain.arrivals import Arrivals
 from hsnoise.effects import AbstractEffect, Stage
+from hsnoise.effects._base import NotDeclared
 
 SCALES = ("read_noise_scale", "dark_current_scale")  # the ways in which an effect scales what another draws
 
@@ -32,7 +33,7 @@ def signals(key, light, shape, effects, capture):
     signal = light if of_light is None else jnp.broadcast_to(light, shape) * of_light
     for effect in effects:
         try:
-            drawn = _sample_one(key, signal, shape, effect, capture)
+            drawn = _sample_one(key, signal, shape, effect, _of(capture, effect))
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise TypeError(
                 f"{effect.name}: JAX cannot compile its sample; use jax.numpy instead of numpy, jnp.where instead of if"
@@ -71,6 +72,12 @@ def apply_fenced(key, light, shape, effects, capture):
         return jax.lax.cond(always, draw, lambda *_: jnp.zeros(counts.shape, counts.dtype), *of)
 
     return jax.lax.platform_dependent(key, light, effects, capture, cpu=fenced, default=draw)
+
+
+def _of(capture, effect):
+    """The capture with the scales that the effect uses: its program is then the same whatever other effects scale."""
+    unused = [what for what in SCALES if what not in effect.scaled_by]
+    return dataclasses.replace(capture, **dict.fromkeys(unused, NotDeclared()))
 
 
 def may_scale(what: str, effect: AbstractEffect) -> bool:

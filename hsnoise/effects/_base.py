@@ -63,6 +63,10 @@ class Stage(enum.IntEnum):
     DIGITAL = 10  # turns DN into counts, or counts into counts
 
 
+class NotDeclared(eqx.Module):
+    """Stands for a scale that an effect does not name in `scaled_by`, and fits into no formula."""
+
+
 class Capture(eqx.Module):
     """How the frames were taken: what an effect can use besides the signal.
 
@@ -74,7 +78,8 @@ class Capture(eqx.Module):
         sensor_key: random key of this sensor: its fixed patterns derive from it, the same in all captures.
         gain: system gain [channel], DN/e-; None if the model has none.
         read_noise: its sigma, rms over pixels, e-; None if the model has none.
-        read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1.
+        read_noise_scale: factor on the read noise of each pixel, [frame or 1, row, column]; None for 1. Only an effect
+            that names it in `scaled_by` can use it.
         dark_current_scale: factor on the dark current of each pixel, as above.
         differentiable: whether counts are floats with a derivative, which ignores rounding.
         window: (first row, first column, rows, columns) of the sensor, if the frames are a part of it only.
@@ -86,8 +91,8 @@ class Capture(eqx.Module):
     cfa: str = eqx.field(static=True)
     shutter: str = eqx.field(static=True)
     sensor_key: RandomKey
-    read_noise_scale: Frames | PixelMap | None = None
-    dark_current_scale: Frames | PixelMap | None = None
+    read_noise_scale: Frames | PixelMap | NotDeclared | None = None
+    dark_current_scale: Frames | PixelMap | NotDeclared | None = None
     gain: PerChannel | None = None
     read_noise: Scalar | None = None
     differentiable: bool = eqx.field(static=True, default=False)
@@ -187,6 +192,7 @@ class AbstractEffect(eqx.Module):
         in_series: whether what happens in a frame depends on those before it, or on how many there were.
         adds: whether it adds electrons that do not depend on the signal.
         in_likelihood: whether the exact likelihood of row histograms knows it; else simulated statistics fit it.
+        scaled_by: scales of the capture that its `sample` uses: "read_noise_scale", "dark_current_scale".
         stream: name of its random key; its own name if empty.
         least_frames: frames of one exposure that it takes to show it.
         selection_nats: penalty on its score, nats, for a detail measured on the capture and not drawn at random.
@@ -201,6 +207,7 @@ class AbstractEffect(eqx.Module):
     in_series: ClassVar[bool] = False
     adds: ClassVar[bool] = False
     in_likelihood: ClassVar[bool] = False
+    scaled_by: ClassVar[tuple[str, ...]] = ()
     stream: ClassVar[str] = ""
     least_frames: ClassVar[int] = 1
     selection_nats: ClassVar[float] = 0.0

@@ -17,6 +17,7 @@ class DarkCurrent(AbstractEffect):
 
     name: ClassVar[str] = "dark_current"
     stage: ClassVar[Stage] = Stage.ELECTRONS
+    scaled_by: ClassVar[tuple[str, ...]] = ("dark_current_scale",)
     in_likelihood: ClassVar[bool] = True
     adds: ClassVar[bool] = True
     rate: Scalar = param("e-/s", low=0, amplitude=True, doc="dark electrons of a pixel in a second")

@@ -58,6 +58,7 @@ class MeasuredDistribution(AbstractEffect):
 
     name: ClassVar[str] = "measured_distribution"
     stage: ClassVar[Stage] = Stage.READ
+    scaled_by: ClassVar[tuple[str, ...]] = ("read_noise_scale",)
     measurable: ClassVar[bool] = True
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation beside that of the normal read noise")
     quantiles: jax.Array = measured(

@@ -20,6 +20,7 @@ class ReadNoise(AbstractEffect):
 
     name: ClassVar[str] = "read_noise"
     stage: ClassVar[Stage] = Stage.READ
+    scaled_by: ClassVar[tuple[str, ...]] = ("read_noise_scale",)
     in_likelihood: ClassVar[bool] = True
     stream: ClassVar[str] = PIXELS
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation of the read noise")

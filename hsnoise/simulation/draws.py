@@ -21,6 +21,7 @@ MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in a
 SURFACE_DEGREE = 3  # of the light on flats
 SPIKE, LEAST_DN = 8.0, 0.5  # deviations of a pixel from the median of those around it; the least of these
 SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
+SPARE_FRAMES = 0.3  # of those that are drawn, for exposures of almost as many frames to share compiled programs
 
 
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
@@ -78,15 +79,28 @@ def draw_capture(key: RandomKey | int, model: NoiseModel, like: FrameStack, befo
     """
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor")
+    firsts = before or [0] * like.n_exposures
+    needed = [first + frames for first, frames in zip(firsts, like.n_frames, strict=True)]
     counts = []
-    for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, like.n_frames, strict=True)):
-        own, first = jax.random.fold_in(named_key(key, "frames"), e), before[e] if before else 0
-        clean = np.broadcast_to(light_of(model, like, e), (first + frames, *like.shape))
+    for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, _alike(needed), strict=True)):
+        own = jax.random.fold_in(named_key(key, "frames"), e)
+        clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
         drawn = sample_by_effect(
             own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key, window=like.window
         )
-        counts.append(np.asarray(drawn)[first:])
+        counts.append(np.asarray(drawn)[firsts[e] : needed[e]])
     return like.with_counts(counts, like.window)
+
+
+def _alike(numbers: Sequence[int]) -> list[int]:
+    """Numbers of frames to draw for those that are needed: compiling an effect for one more takes as long as drawing
+    many frames.
+    """
+    kept: list[int] = []
+    for number in sorted(set(numbers), reverse=True):
+        if not kept or number < (1 - SPARE_FRAMES) * kept[-1]:
+            kept.append(number)
+    return [min(size for size in kept if size >= number) for number in numbers]
 
 
 def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:
