@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from hsnoise._core.arguments import callback, seed_of
 from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
@@ -35,7 +33,7 @@ from hsnoise.criticism.outcomes import (
 )
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.resume import read_steps
-from hsnoise.criticism.story import Step, Story
+from hsnoise.criticism.story import Step, Story, moved
 from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
 from hsnoise.fit import fit, rechecked
 from hsnoise.fitting.result import FitResult, Method, Status, number
@@ -238,7 +236,7 @@ class _Work:
         comparison = compared(result.params, self.portion, draws=draws, seed=self.seed, tick=tick)
         comparison = with_shares(comparison, result.params, self.portion, self.seed)
         log.info("Error %s with %s", number(comparison.error), added or "the first model")
-        return Step(result, comparison, None, added, moved=_moved(steps[-1].fit, result) if steps else ())
+        return Step(result, comparison, None, added, moved=moved(steps[-1].fit, result) if steps else ())
 
     def started(self, first: FitResult) -> list[Step]:
         """The first steps of a fit or, if it has no gain, of one that follows each pixel if that comes nearer."""
@@ -293,44 +291,61 @@ class _Work:
         """The first candidate with which the model is better, as a step, and why those before it were left out."""
         refused: dict[str, Refusal] = {}
         for candidate in candidates:
-            found = self.with_one_more(steps, candidate)
             judge = self.judge.of_effect(candidate.effect, self.portion)
-            why = Refusal(Refused.NOT_FITTED) if found is None else self.judged(judge, steps, found[0], candidate.name)
-            if isinstance(why, Improvement):
-                step = replace(self.step(found[0], candidate.name, steps), ahead=found[1])
-                if judge is self.judge:  # NaN if no frames are held out
-                    step = replace(step, held_out=steps[-1].held_out + why.nats, held_out_error=why.error)
-                else:
-                    step = replace(step, held_out=self.judge.score(step.fit.params), gained=why.nats)
-                return replace(step, fit=rechecked(step.fit, self.fitted)), refused
-            refused[candidate.name] = why
-            self.say(Event(f"{candidate.name} is left out: {sentences.refusal(why)}"))
+            found = self.with_one_more(steps, candidate.effect, judge)
+            if isinstance(found, Refusal):
+                refused[candidate.name] = found
+                self.say(Event(f"{candidate.name} is left out: {sentences.refusal(found)}"))
+                continue
+            result, gain, ahead = found
+            step = replace(self.step(result, candidate.name, steps), ahead=ahead)
+            if judge is self.judge:  # NaN if no frames are held out
+                step = replace(step, held_out=steps[-1].held_out + gain.nats, held_out_error=gain.error)
+            else:
+                step = replace(step, held_out=self.judge.score(step.fit.params), gained=gain.nats)
+            return replace(step, fit=rechecked(step.fit, self.fitted)), refused
         return None, refused
+
+    def with_one_more(
+        self, steps: list[Step], effect: AbstractEffect, judge: Judge
+    ) -> tuple[FitResult, Improvement, float] | Refusal:
+        """A fit with the effect, what it gains, and by how many nats its side of the gain is ahead; or why it is none.
+
+        `diagnose` judges the side from a base fit that the effect has biased: what holds is fitted on the other, too.
+        """
+        own = self.fitted_with(steps, effect, f"adding {effect.name}")
+        if own is None:
+            return Refusal(Refused.NOT_FITTED)
+        gain = self.judged(judge, steps, own, effect.name)
+        if isinstance(gain, Refusal):
+            return gain
+        if not has_sides(effect):
+            return own, gain, float("nan")
+        side = next(side for side in Side if side != side_of(effect))
+        other = self.fitted_with(steps, on_side(effect, side), "the same on the other side of the gain")
+        if other is None:
+            return own, gain, float("nan")
+        of_own, of_other = (score_of_side(one.params, self.portion, self.seed) for one in (own, other))
+        if of_own >= of_other:
+            return own, gain, of_own - of_other
+        of_it = self.judged(judge, steps, other, effect.name)
+        return (own, gain, float("nan")) if isinstance(of_it, Refusal) else (other, of_it, of_other - of_own)
+
+    def fitted_with(self, steps: list[Step], effect: AbstractEffect, what: str) -> FitResult | None:
+        """The last model refitted with one effect more; None if it cannot be."""
+        stage = _stage(what, steps)
+        self.say(stage)
+        try:
+            return _fit_with(effect, steps, self, self.counter(stage))
+        except (RuntimeError, ValueError) as error:
+            self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
+            return None
 
     def judged(self, judge: Judge, steps: list[Step], result: FitResult, added: str) -> Improvement | Refusal:
         """What a judge says of a fit with one effect more."""
         stage = _stage(f"judging {added} by frames {'held out' if judge.unseen else 'that were fitted'}", steps)
         self.say(stage)
         return judged(judge, steps[-1].fit, result, added, self.counter(stage))
-
-    def with_one_more(self, steps: list[Step], candidate: Candidate) -> tuple[FitResult, float] | None:
-        """A fit with the candidate, on the side of the gain where it fits better, and by how much, nats.
-
-        None if it cannot be fitted. `diagnose` judges the side from a base fit that the effect has biased.
-        """
-        fits: list[FitResult] = []
-        for effect in _sides(candidate.effect):
-            is_first = effect is candidate.effect
-            stage = _stage(f"adding {effect.name}" if is_first else "the same on the other side of the gain", steps)
-            self.say(stage)
-            try:
-                fits.append(_fit_with(effect, steps, self, self.counter(stage)))
-            except (RuntimeError, ValueError) as error:
-                self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
-        if len(fits) < 2:
-            return (fits[0], float("nan")) if fits else None
-        values = [score_of_side(one.params, self.portion, self.seed) for one in fits]
-        return fits[int(np.argmax(values))], abs(values[0] - values[1])
 
 
 def _stage(what: str, steps: Sequence[Step]) -> Event:
@@ -362,13 +377,6 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
     return (*found.nearest, *others)[:MOST_TRIED]
 
 
-def _sides(effect: AbstractEffect) -> tuple[AbstractEffect, ...]:
-    """The effect, and if it may arise before or after the gain, the same on the other side."""
-    if not has_sides(effect):
-        return (effect,)
-    return effect, *(on_side(effect, side) for side in Side if side != side_of(effect))
-
-
 def _fit_with(effect: AbstractEffect, steps: list[Step], work: _Work, tick: Callable[[], None]) -> FitResult:
     """A fit of the last model and one effect more; it starts from the last fit by likelihood if possible."""
     model = steps[-1].fit.params.add(effect)
@@ -376,15 +384,6 @@ def _fit_with(effect: AbstractEffect, steps: list[Step], work: _Work, tick: Call
     if base is None or any(one.in_likelihood and one.name not in base.params for one in model):
         return fit(work.fitted, model=model)
     return fit_synthetic(base, work.portion, model, seed=work.seed, tick=tick)
-
-
-def _moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
-    moved = []
-    for name in before.names:
-        (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
-        if abs(new - old) > rules.MOVED_SIGMA * max(error, new_error) > 0:
-            moved.append(sentences.moved(name, (old, error), (new, new_error), unit))
-    return tuple(moved)
 
 
 def _ending(found: Diagnosis, comparison: Comparison, refused: Mapping[str, Refusal] | None = None) -> Ending:

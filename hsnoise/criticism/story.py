@@ -241,3 +241,13 @@ def _because(before: Step, after: Step) -> str:
     score = next((one.score for one in ranking if one.name == after.added), 0.0)
     is_nearest = found is not None and found.verdict == Verdict.UNEXPLAINED and not after.comparison.fits
     return sentences.because(nearer(before.comparison, after.comparison), score, is_nearest)
+
+
+def moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
+    """Base parameters that changed by more than their errors from one fit to another, in words."""
+    found = []
+    for name in before.names:
+        (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]
+        if abs(new - old) > rules.MOVED_SIGMA * max(error, new_error) > 0:
+            found.append(sentences.moved(name, (old, error), (new, new_error), unit))
+    return tuple(found)

@@ -21,7 +21,7 @@ from hsnoise.criticism.acceptance import is_too_little
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.held_out import Judge, split_frames
 from hsnoise.criticism.improve import _ending, _Work
-from hsnoise.criticism.outcomes import Ended, Ending, Improvement, Refusal, Refused
+from hsnoise.criticism.outcomes import Ended, Ending, Improvement, Refusal, Refused, Side, side_of
 from hsnoise.criticism.story import Step, Story, together
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
@@ -201,10 +201,10 @@ def test_improve_decides_the_side_of_the_gain_by_refits(tmp_path):
     """Whatever side `diagnose` took."""
     stack, told = simulated(tmp_path)[0], []
     steps = [Step(hsnoise.fit(stack), SimpleNamespace(error=9.0), None, None, float("nan"), ())]
-    wrong = SimpleNamespace(name="row_noise", effect=fx.RowNoise(1.4, after_gain=True))
-    work = _Work(stack, Portion.of(stack), Judge(Portion.of(stack), False, 0), 0, lambda event: told.append(str(event)))
-    fit, ahead = work.with_one_more(steps, wrong)
-    assert fit.params["row_noise"].after_gain is False and ahead > 0 and hsnoise.compare(fit, stack).fits
+    judge = Judge(Portion.of(stack), False, 0)
+    work = _Work(stack, Portion.of(stack), judge, 0, lambda event: told.append(str(event)))
+    fit, gain, ahead = work.with_one_more(steps, fx.RowNoise(1.4, after_gain=True), judge)
+    assert fit.params["row_noise"].after_gain is False and ahead > 0 and hsnoise.compare(fit, stack).fits and gain.holds
     assert any("adding row_noise" in sentence for sentence in told)
     assert any("other side of the gain" in sentence and sentence[-1].isdigit() for sentence in told)
 
@@ -252,21 +252,21 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
     candidates, told = [SimpleNamespace(name=name, effect=effect) for name, effect in effects.items()], []
     before, fit, tried = Step(None, None, None, None, held_out=-20.0), SimpleNamespace(doubts=("before",)), []
     checked = SimpleNamespace(doubts=())
-    alike = Refusal(Refused.NO_CHANGE, Improvement(0.5, 0.2, 1))
-    why = {"frame_offset": alike, "column_noise": Improvement(30.0, 2.0, 1)}
+    reasons = {
+        "row_noise": Refusal(Refused.NOT_FITTED),
+        "frame_offset": Refusal(Refused.NO_CHANGE, Improvement(0.5, 0.2, 1)),
+    }
 
-    def with_one_more(self, steps, candidate):
-        tried.append(candidate.name)
-        return None if candidate.name == "row_noise" else (fit, 9.0)
+    def with_one_more(self, steps, effect, judge):
+        tried.append(effect.name)
+        return reasons.get(effect.name, (fit, Improvement(30.0, 2.0, 1), 9.0))
 
     of = importlib.import_module("hsnoise.criticism.improve")
     monkeypatch.setattr(_Work, "with_one_more", with_one_more)
     monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
-    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: why[name])
     monkeypatch.setattr(of, "rechecked", lambda *of: checked)
     judge = SimpleNamespace(of_effect=lambda effect, portion: judge)
     work = _Work(None, None, judge, 0, lambda event: told.append(str(event)))
-    reasons = {"row_noise": Refusal(Refused.NOT_FITTED), "frame_offset": alike}
     kept = Step(checked, None, None, "column_noise", held_out=10.0, ahead=9.0, held_out_error=2.0)
     assert work.first_that_holds(candidates, [before]) == (kept, reasons)
     assert tried == ["row_noise", "frame_offset", "column_noise"]
@@ -281,9 +281,8 @@ def test_what_the_frames_of_the_fit_judged_is_told(monkeypatch):
     """Frames held out then say only how likely they are."""
     fit = SimpleNamespace(params={"image_lag": fx.ImageLag(0.04)}, in_dn=lambda name: {}, doubts=())
     of = importlib.import_module("hsnoise.criticism.improve")
-    monkeypatch.setattr(_Work, "with_one_more", lambda *of: (fit, float("nan")))
+    monkeypatch.setattr(_Work, "with_one_more", lambda *of: (fit, Improvement(30.0, 2.0, 1), float("nan")))
     monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
-    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: Improvement(30.0, 2.0, 1))
     monkeypatch.setattr(of, "rechecked", lambda fit, frames: fit)
     judge = SimpleNamespace(of_effect=lambda effect, portion: object(), score=lambda model: -25.0)
     candidate = SimpleNamespace(name="image_lag", effect=fx.ImageLag(0.04))
@@ -291,6 +290,26 @@ def test_what_the_frames_of_the_fit_judged_is_told(monkeypatch):
     step, _ = work.first_that_holds([candidate], [Step(fit, None, None, None, held_out=-20.0)])
     assert step.held_out == -25.0 and np.isnan(step.held_out_error) and step.gained == 30.0
     assert "those of the fit are predicted better by 30.0 nats" in step.sizes[-1]
+
+
+@pytest.mark.parametrize(("scores", "side"), [((5.0, 3.0), Side.BEFORE), ((3.0, 5.0), Side.AFTER)])
+def test_only_what_holds_is_tried_on_the_other_side(monkeypatch, scores, side):
+    of = importlib.import_module("hsnoise.criticism.improve")
+    score, fitted = dict(zip(Side, scores, strict=True)), []
+
+    def fitted_with(self, steps, effect, what):
+        fitted.append(side_of(effect))
+        return SimpleNamespace(params=side_of(effect))
+
+    monkeypatch.setattr(_Work, "fitted_with", fitted_with)
+    monkeypatch.setattr(of, "score_of_side", lambda params, portion, seed: score[params])
+    work, gain, effect = _Work(None, None, None, 0, print), Improvement(30.0, 2.0, 1), fx.RowNoise(1.0)
+    monkeypatch.setattr(_Work, "judged", lambda *of: gain)
+    fit, same, ahead = work.with_one_more([], effect, None)
+    assert (fit.params, same, ahead) == (side, gain, 2.0) and fitted == list(Side)
+    refusal = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1))
+    monkeypatch.setattr(_Work, "judged", lambda *of: refusal)
+    assert work.with_one_more([], effect, None) is refusal and len(fitted) == 3
 
 
 def test_what_was_tried_in_vain_is_told_with_the_reason():
