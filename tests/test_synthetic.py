@@ -162,8 +162,9 @@ class Arcs(Simulator):
 
 def test_a_step_that_leads_away_is_taken_back():
     problem = Bent()
-    y, covariance, length, iterations = _search(problem, Arcs(None, None, None))
-    assert length < SHORT_STEP and iterations < MOST_ITERATIONS
+    draft = _search(problem, Arcs(None, None, None))
+    y, covariance = draft.after_last_step()
+    assert draft.last_step < SHORT_STEP and draft.iterations < MOST_ITERATIONS
     assert np.all(np.abs(y - problem.truth) < 4 * np.sqrt(np.diagonal(covariance)))
     assert np.all(np.sqrt(np.diagonal(covariance)) < 0.05)
 
@@ -190,8 +191,8 @@ class Rough(Simulator):
 
 @pytest.mark.slow
 def test_noise_of_slopes_is_not_taken_for_information():
-    found = [_search(Plain(), Rough(None, None, 10_000 + number)) for number in range(100)]
-    pulls = np.array([(y - Plain.truth) / np.sqrt(np.diagonal(covariance)) for y, covariance, *_ in found])
+    found = [_search(Plain(), Rough(None, None, 10_000 + number)).after_last_step() for number in range(100)]
+    pulls = np.array([(y - Plain.truth) / np.sqrt(np.diagonal(covariance)) for y, covariance in found])
     assert 0.9 < np.sqrt(np.mean(pulls**2)) < 1.2  # 200 pulls: 1 +- 0.05, and their errors are from 32 draws
 
 

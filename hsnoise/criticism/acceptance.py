@@ -10,10 +10,11 @@ from hsnoise.criticism.outcomes import Improvement, Refusal, Refused
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.story import Step
 from hsnoise.fitting.result import FitResult
+from hsnoise.fitting.simulated import Draft
 
 
 def judged(
-    judge: Judge, before: FitResult, after: FitResult, added: str, tick: Callable[[], None]
+    judge: Judge, before: FitResult, after: FitResult | Draft, added: str, tick: Callable[[], None]
 ) -> Improvement | Refusal:
     """What a fit gains by an added effect, or why it is left out.
 

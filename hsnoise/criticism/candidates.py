@@ -15,10 +15,20 @@ import numpy as np
 
 from hsnoise._core.arguments import listed
 from hsnoise._core.types import RandomKey, channel_index
-from hsnoise.effects import EFFECTS, AbstractEffect, CaptureFacts, Maker
+from hsnoise.effects import (
+    ADC,
+    EFFECTS,
+    AbstractEffect,
+    CaptureFacts,
+    DarkCurrent,
+    Gain,
+    Maker,
+    ReadNoise,
+    ShotNoise,
+)
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import black_level_of, check_effects, draw_capture, light_of
+from hsnoise.simulation.draws import black_level_of, check_effects, check_fits, draw_capture, light_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Purpose, key_for
 from hsnoise.statistics.panels import may_be_outputs
@@ -190,3 +200,14 @@ def with_own_statistics(model: NoiseModel, candidates: Iterable[Suspect]) -> Cal
         )
 
     return measure if own else None
+
+
+def check_start(model: NoiseModel | None, candidates: tuple[Suspect, ...], portion: Portion, seed: int) -> None:
+    """Raise ValueError or TypeError for a model or candidates that cannot be drawn."""
+    if not candidates:
+        return
+    stack = portion.frames
+    typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
+    base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
+    check_fits(base, stack, "model")
+    check_makers(not_in(base, candidates), base, stack, facts_of(base, portion, seed))

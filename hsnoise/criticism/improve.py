@@ -6,13 +6,15 @@ import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from hsnoise._core.arguments import callback, seed_of
 from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
 from hsnoise.criticism.acceptance import is_too_little, judged
-from hsnoise.criticism.candidates import Suspect, check_candidates, check_makers, facts_of, not_in
+from hsnoise.criticism.candidates import Suspect, check_candidates, check_start
 from hsnoise.criticism.closing import closed, repeated_darks
 from hsnoise.criticism.compare import DRAWS, Comparison, compared, with_shares
 from hsnoise.criticism.diagnose import diagnosed
@@ -34,17 +36,18 @@ from hsnoise.criticism.outcomes import (
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.resume import read_steps
 from hsnoise.criticism.story import Step, Story, moved
-from hsnoise.effects import ADC, AbstractEffect, DarkCurrent, Gain, ReadNoise, ShotNoise
+from hsnoise.effects import AbstractEffect
 from hsnoise.fit import fit, rechecked
 from hsnoise.fitting.result import FitResult, Method, Status, number
-from hsnoise.fitting.simulated import fit_synthetic
+from hsnoise.fitting.simulated import Draft, draft_synthetic
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
-from hsnoise.simulation.draws import check_fits
 from hsnoise.simulation.portion import Portion
 
 log = logging.getLogger(__name__)
+
+Fit = TypeVar("Fit", FitResult, FitResult | Draft)
 
 MOST_TRIED = 4  # effects, where none explains all
 PASSING = 12  # draws to judge a model that is far off, on which nothing depends
@@ -124,7 +127,7 @@ def improved(
     darks = Portion.of(stack).darks.frames
     fitted, held_out = split_frames(darks, stack)
     portion = Portion.of(fitted)
-    _check_start(model, candidates, portion, seed)
+    check_start(model, candidates, portion, seed)
     limit = Limit.of(max_minutes, max_steps)
     judge = Judge(portion, False, seed) if held_out is None else Judge.of(fitted, held_out, seed)
     split = split_in_words(fitted, held_out)
@@ -313,35 +316,41 @@ class _Work:
 
         `diagnose` judges the side from a base fit that the effect has biased: what holds is fitted on the other, too.
         """
-        own = self.fitted_with(steps, effect, f"adding {effect.name}")
-        if own is None:
+        found, ahead = self.fitted_with(steps, effect, f"adding {effect.name}"), float("nan")
+        if found is None:
             return Refusal(Refused.NOT_FITTED)
-        gain = self.judged(judge, steps, own, effect.name)
+        gain = self.judged(judge, steps, found, effect.name)
         if isinstance(gain, Refusal):
             return gain
-        if not has_sides(effect):
-            return own, gain, float("nan")
-        side = next(side for side in Side if side != side_of(effect))
-        other = self.fitted_with(steps, on_side(effect, side), "the same on the other side of the gain")
-        if other is None:
-            return own, gain, float("nan")
-        of_own, of_other = (score_of_side(one.params, self.portion, self.seed) for one in (own, other))
-        if of_own >= of_other:
-            return own, gain, of_own - of_other
-        of_it = self.judged(judge, steps, other, effect.name)
-        return (own, gain, float("nan")) if isinstance(of_it, Refusal) else (other, of_it, of_other - of_own)
+        first = found
+        if has_sides(effect):
+            side = next(side for side in Side if side != side_of(effect))
+            other = self.fitted_with(steps, on_side(effect, side), "the same on the other side of the gain")
+            if other is not None:
+                scores = [score_of_side(one.params, self.portion, self.seed) for one in (found, other)]
+                found, ahead = (found, other)[int(np.argmax(scores))], abs(scores[0] - scores[1])
+        result = self.tried(found.finished, effect) if isinstance(found, Draft) else found
+        if result is None:
+            return Refusal(Refused.NOT_FITTED)
+        if result is not first:
+            gain = self.judged(judge, steps, result, effect.name)
+        return gain if isinstance(gain, Refusal) else (result, gain, ahead)
 
-    def fitted_with(self, steps: list[Step], effect: AbstractEffect, what: str) -> FitResult | None:
-        """The last model refitted with one effect more; None if it cannot be."""
+    def fitted_with(self, steps: list[Step], effect: AbstractEffect, what: str) -> FitResult | Draft | None:
+        """The last model refitted with one effect more, or nearly; None if it cannot be."""
         stage = _stage(what, steps)
         self.say(stage)
+        return self.tried(lambda: _fit_with(effect, steps, self, self.counter(stage)), effect)
+
+    def tried(self, fitting: Callable[[], Fit], effect: AbstractEffect) -> Fit | None:
+        """A fit; None if it fails, which is told."""
         try:
-            return _fit_with(effect, steps, self, self.counter(stage))
+            return fitting()
         except (RuntimeError, ValueError) as error:
             self.say(Event(f"{effect.name} cannot be fitted here: {error}"))
             return None
 
-    def judged(self, judge: Judge, steps: list[Step], result: FitResult, added: str) -> Improvement | Refusal:
+    def judged(self, judge: Judge, steps: list[Step], result: FitResult | Draft, added: str) -> Improvement | Refusal:
         """What a judge says of a fit with one effect more."""
         stage = _stage(f"judging {added} by frames {'held out' if judge.unseen else 'that were fitted'}", steps)
         self.say(stage)
@@ -352,17 +361,6 @@ def _stage(what: str, steps: Sequence[Step]) -> Event:
     """What is being done for the step after `steps`, and how the error has changed so far."""
     errors = sentences.errors_so_far([step.comparison.error for step in steps])
     return Event(f"Step {len(steps)}: {what}", errors)
-
-
-def _check_start(model: NoiseModel | None, candidates: tuple[Suspect, ...], portion: Portion, seed: int) -> None:
-    """Raise ValueError or TypeError for a model or candidates that cannot be drawn."""
-    if not candidates:
-        return
-    stack = portion.frames
-    typical = [ShotNoise(), DarkCurrent(50.0), ReadNoise(3.0), Gain(1.0), ADC()]
-    base = NoiseModel(typical, cfa=stack.cfa, shutter=stack.shutter, exposure_s=0.1) if model is None else model
-    check_fits(base, stack, "model")
-    check_makers(not_in(base, candidates), base, stack, facts_of(base, portion, seed))
 
 
 def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
@@ -377,13 +375,13 @@ def _nearest(found: Diagnosis) -> tuple[Candidate, ...]:
     return (*found.nearest, *others)[:MOST_TRIED]
 
 
-def _fit_with(effect: AbstractEffect, steps: list[Step], work: _Work, tick: Callable[[], None]) -> FitResult:
+def _fit_with(effect: AbstractEffect, steps: list[Step], work: _Work, tick: Callable[[], None]) -> FitResult | Draft:
     """A fit of the last model and one effect more; it starts from the last fit by likelihood if possible."""
     model = steps[-1].fit.params.add(effect)
     base = next((step.fit for step in reversed(steps) if step.fit.method != Method.SYNTHETIC), None)
     if base is None or any(one.in_likelihood and one.name not in base.params for one in model):
         return fit(work.fitted, model=model)
-    return fit_synthetic(base, work.portion, model, seed=work.seed, tick=tick)
+    return draft_synthetic(base, work.portion, model, seed=work.seed, tick=tick)
 
 
 def _ending(found: Diagnosis, comparison: Comparison, refused: Mapping[str, Refusal] | None = None) -> Ending:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.gamma import gamma
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
 from hsnoise.effects._facts import CaptureFacts, Maker
@@ -63,7 +64,7 @@ class ElectronMultiplication(AbstractEffect):
         entering = signal + draw_poisson(clocks, self.clock_induced, signal.shape)
         shape = self.excess * entering
         some = shape > 0
-        drawn = jax.random.gamma(register, jnp.where(some, shape, 1), signal.shape, signal.dtype)
+        drawn = gamma(register, jnp.where(some, shape, 1))
         return entering - jnp.where(some, shape - drawn, 0)
 
     @classmethod

@@ -52,11 +52,72 @@ def fit_synthetic(
     base: fit of the same capture without those effects. model: its values start the search for the effects.
     Raises RuntimeError if the statistics of the model's draws are not finite.
     """
+    return draft_synthetic(base, portion, model, seed=seed, tick=tick).finished()
+
+
+def draft_synthetic(
+    base: FitResult,
+    portion: Portion,
+    model: NoiseModel,
+    *,
+    seed: int = 0,
+    tick: Callable[[], None] = lambda: None,
+) -> Draft:
+    """`fit_synthetic` without its end, which takes almost half of the draws."""
     extra = tuple(name for name in model.names if name not in base.params)
     whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
     problem = Problem(portion, base, whole, extra, model)
     key = key_for(seed, Purpose.REFIT)
-    return _result(problem, *_search(problem, Simulator(base.params, portion, key, tick, problem.statistics)))
+    return _search(problem, Simulator(base.params, portion, key, tick, problem.statistics))
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """Where the search of a fit ended: near enough to be judged, without standard errors.
+
+    Attributes:
+        problem, yard: what is fitted, and the scale of the statistics; y: the parameters that were found.
+        weight: of the statistics; by: steps of derivatives [number].
+        last_step: in standard errors; iterations: of the search.
+    """
+
+    problem: Problem
+    yard: _Yardstick
+    y: np.ndarray
+    weight: np.ndarray
+    by: np.ndarray
+    last_step: float
+    iterations: int
+
+    @property
+    def params(self) -> NoiseModel:
+        """The model."""
+        return self.problem.in_float64(self.y)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the fitted numbers."""
+        return (*self.problem.base.names, *self.problem.added.names)
+
+    def finished(self) -> FitResult:
+        """The fit, by one step more and with standard errors."""
+        y, covariance = self.after_last_step()
+        return _result(self.problem, y, covariance, self.last_step, self.iterations)
+
+    def after_last_step(self) -> tuple[np.ndarray, np.ndarray]:
+        """y after a step from where the search ended, and its covariance.
+
+        The search knows means only to a third of their scatter, slopes only from two draws, and the scatter only where
+        it began.
+        """
+        y, yard, problem = self.y, self.yard, self.problem
+        last = yard.simulator.reference(problem.at(y), LAST_DRAWS)
+        here, slopes = yard.point(y, LAST_DRAWS), yard.slopes(y, self.by, LAST_SLOPES)
+        gain = slopes.T @ self.weight
+        covariance = np.linalg.inv(gain @ slopes + np.diag(problem.prior))
+        step = covariance @ here.uphill(gain, problem)
+        scattered = as_scattered(covariance, gain, problem.prior, (last.draws - last.mean) / yard.deviation)
+        return y + step * problem.share_of(step), scattered
 
 
 @dataclass(frozen=True)
@@ -135,8 +196,8 @@ def _without_noise(slopes: np.ndarray) -> np.ndarray:
     return mean * np.clip(1 - SLOPE_NOISE * pooled / np.maximum(mean**2, 1e-300), 0, 1)
 
 
-def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Where simulation matches measurement: y, its covariance, the last step in standard errors, iterations.
+def _search(problem: Problem, simulator: Simulator) -> Draft:
+    """Where simulation matches measurement.
 
     Gauss-Newton, with Levenberg's damping after a step that fits worse and Broyden's updates of the derivatives.
     Statistics that are far off count less (Huber), so that what the model still lacks does not bias the rest.
@@ -173,24 +234,7 @@ def _search(problem: Problem, simulator: Simulator) -> tuple[np.ndarray, np.ndar
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
-    return *_last_step(problem, yard, here.y, weight, by), length, iterations
-
-
-def _last_step(
-    problem: Problem, yard: _Yardstick, y: np.ndarray, weight: np.ndarray, by: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """y after a step from where the search ended, and its covariance.
-
-    The search knows means only to a third of their scatter, slopes only from two draws, and the scatter only where it
-    began.
-    """
-    last = yard.simulator.reference(problem.at(y), LAST_DRAWS)
-    here, slopes = yard.point(y, LAST_DRAWS), yard.slopes(y, by, LAST_SLOPES)
-    gain = slopes.T @ weight
-    covariance = np.linalg.inv(gain @ slopes + np.diag(problem.prior))
-    step = covariance @ here.uphill(gain, problem)
-    scattered = as_scattered(covariance, gain, problem.prior, (last.draws - last.mean) / yard.deviation)
-    return here.y + step * problem.share_of(step), scattered
+    return Draft(problem, yard, here.y, weight, by, length, iterations)
 
 
 def _updated(slopes: np.ndarray, here: _Point, there: _Point) -> np.ndarray:

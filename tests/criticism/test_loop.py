@@ -23,6 +23,7 @@ from hsnoise.criticism.held_out import Judge, split_frames
 from hsnoise.criticism.improve import _ending, _Work
 from hsnoise.criticism.outcomes import Ended, Ending, Improvement, Refusal, Refused, Side, side_of
 from hsnoise.criticism.story import Step, Story, together
+from hsnoise.fitting.simulated import Draft
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
 
@@ -310,6 +311,28 @@ def test_only_what_holds_is_tried_on_the_other_side(monkeypatch, scores, side):
     refusal = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1))
     monkeypatch.setattr(_Work, "judged", lambda *of: refusal)
     assert work.with_one_more([], effect, None) is refusal and len(fitted) == 3
+
+
+def test_a_fit_is_finished_only_if_it_holds_so_far(monkeypatch):
+    """Its standard errors take almost half of the draws."""
+    draft, whole, seen = Draft(*[None] * 7), SimpleNamespace(), []
+    refusal, gain = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1)), Improvement(30.0, 2.0, 1)
+    of = {id(draft): refusal, id(whole): gain}
+    monkeypatch.setattr(_Work, "fitted_with", lambda *of: draft)
+    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: of[id(fit)])
+    monkeypatch.setattr(Draft, "finished", lambda self: seen.append(self) or whole)
+    work, effect = _Work(None, None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
+    assert work.with_one_more([], effect, None) is refusal and not seen
+    of |= {id(draft): gain, id(whole): refusal}
+    assert work.with_one_more([], effect, None) is refusal and seen == [draft]
+    of[id(whole)] = better = Improvement(31.0, 2.0, 1)
+    assert work.with_one_more([], effect, None)[:2] == (whole, better)
+
+    def fails(self):
+        raise ValueError("singular matrix")
+
+    monkeypatch.setattr(Draft, "finished", fails)
+    assert work.with_one_more([], effect, None) == Refusal(Refused.NOT_FITTED)
 
 
 def test_what_was_tried_in_vain_is_told_with_the_reason():
