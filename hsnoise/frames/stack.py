@@ -222,9 +222,10 @@ class FrameStack:
     def with_counts(self, counts: Sequence[np.ndarray], window: Window | None) -> FrameStack:
         """A stack of other `counts`, one array per exposure in sensor orientation, taken under the same conditions.
 
-        Their values are not checked: what would mean a broken file may be a valid draw of a quiet camera.
+        Flats elsewhere on the sensor are left out: they are no such counts. Values are not checked: what would mean a
+        broken file may be a valid draw of a quiet camera.
         """
-        unknown = {"black_level": None, "photons_e": None, "temperature_c": None, "iso": None, "row_axis": 0}
+        unknown = dict.fromkeys(("black_level", "photons_e", "temperature_c", "iso", "elsewhere")) | {"row_axis": 0}
         stack = object.__new__(FrameStack)
         for name in self.__dataclass_fields__:
             object.__setattr__(stack, name, unknown.get(name, getattr(self, name)))
