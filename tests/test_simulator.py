@@ -19,7 +19,7 @@ from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation import portion as cutting
 from hsnoise.simulation import simulator as drawing
-from hsnoise.simulation.draws import _without_spikes
+from hsnoise.simulation.draws import _alike, _without_spikes, draw_capture
 from hsnoise.simulation.portion import LEAST_COLUMNS, LEAST_FRAMES, Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import Structure
@@ -118,6 +118,31 @@ def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
     unseen = keys_of(lambda: Judge(portion, True, 0).score(truth))
     for one, other in combinations([tuned, refitted, judged, unseen], 2):
         assert one and other and not one & other
+
+
+@pytest.mark.parametrize(
+    ("needed", "drawn"),
+    [
+        ([4, 5, 5], [5, 5, 5]),
+        ([8, 8], [8, 8]),
+        ([20, 2, 13, 12], [20, 2, 13, 13]),
+        ([10, 9, 7, 6, 5, 1], [10, 10, 10, 6, 6, 1]),
+    ],
+)
+def test_exposures_of_almost_as_many_frames_share_programs(needed, drawn):
+    assert _alike(needed) == drawn
+
+
+def test_frames_that_are_drawn_to_share_programs_are_left_out():
+    """And those before the ones that are wanted; the others are the same frames."""
+    whole = empty_stack(5)
+    like = FrameStack([whole.counts[0][:4], whole.counts[1]], EXPOSURE_S)
+    drawn, same = draw_capture(3, MODEL, like), draw_capture(3, MODEL, whole)
+    assert drawn.n_frames == (4, 5)
+    later = draw_capture(3, MODEL, like.select(frames=slice(0, 2)), before=(1, 3))
+    for i in range(2):
+        np.testing.assert_array_equal(drawn.counts[i], same.counts[i][: drawn.n_frames[i]])
+        np.testing.assert_array_equal(later.counts[i], same.counts[i][(1, 3)[i] : (3, 5)[i]])
 
 
 def test_nothing_is_drawn_twice():

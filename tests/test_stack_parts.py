@@ -137,7 +137,9 @@ def test_what_loading_knows_is_kept():
     drawn = part.with_counts([dark_counts(2, 4, 6)] * 2, None)
     for one in (stack, part, drawn):
         assert one.stated_gain == EGAIN and one.assumed == ("A dark is one", "A flat is one")
+    for one in (stack, part):
         assert one.elsewhere.shape == (10, 6) and one.elsewhere.n_frames == (4,)
+    assert drawn.elsewhere is None  # each draw would be measured with the same real flats
     np.testing.assert_array_equal(part.overscan_dn, [np.nan, 90])
     np.testing.assert_array_equal(FrameStack.join(known_darks(), flats_of(8)).overscan_dn, [90, np.nan, np.nan])
 
