@@ -23,6 +23,20 @@ Counts = UInt[Array, "frame row column"]
 Window = tuple[int, int, int, int]  # first row, first column, rows and columns of the sensor
 RandomKey = Key[Array, ""] | UInt32[Array, "2"]
 
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class NotDeclared:
+    """Stands for a scale of the capture that an effect uses without naming it in `scaled_by`: it fits no formula."""
+
+    what: str
+
+    def __rmul__(self, other):
+        raise TypeError(f'capture.{self.what}: an effect that uses it names it: scaled_by = ("{self.what}",)')
+
+    __mul__ = __rmul__
+
+
 BAYER_CFAS = ("RGGB", "BGGR", "GRBG", "GBRG")
 SHUTTERS = ("rolling", "global")
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.keys import named_key
+from hsnoise._core.types import NotDeclared
 from hsnoise.chain.arrivals import Arrivals
 from hsnoise.effects import AbstractEffect, Stage
-from hsnoise.effects._base import NotDeclared
 
 SCALES = ("read_noise_scale", "dark_current_scale")  # the ways in which an effect scales what another draws
 
@@ -77,7 +77,7 @@ def apply_fenced(key, light, shape, effects, capture):
 def _of(capture, effect):
     """The capture with the scales that the effect uses: its program is then the same whatever other effects scale."""
     unused = [what for what in SCALES if what not in effect.scaled_by]
-    return dataclasses.replace(capture, **dict.fromkeys(unused, NotDeclared()))
+    return dataclasses.replace(capture, **{what: NotDeclared(what) for what in unused})
 
 
 def may_scale(what: str, effect: AbstractEffect) -> bool:

@@ -31,6 +31,7 @@ from hsnoise._core.types import (
     Counts,
     FrameRows,
     Frames,
+    NotDeclared,
     PerChannel,
     PixelMap,
     RandomKey,
@@ -61,10 +62,6 @@ class Stage(enum.IntEnum):
     BLACK = 8  # adds an offset, DN
     CONVERSION = 9  # shapes the steps of the converter, DN
     DIGITAL = 10  # turns DN into counts, or counts into counts
-
-
-class NotDeclared(eqx.Module):
-    """Stands for a scale that an effect does not name in `scaled_by`, and fits into no formula."""
 
 
 class Capture(eqx.Module):

@@ -95,6 +95,32 @@ def test_an_effect_that_jax_cannot_compile_is_named(change):
         CALLS["compare"](Mine(change))
 
 
+class OwnReadNoise(hsnoise.AbstractEffect):
+    """Read noise that says which scale it takes, or does not."""
+
+    name: ClassVar[str] = "own_read_noise"
+    stage: ClassVar[hsnoise.Stage] = hsnoise.Stage.READ
+    sigma: jax.Array = hsnoise.param("e-", low=0, doc="standard deviation")
+
+    def sample(self, signal, capture, *, key):
+        noise = self.sigma * jax.random.normal(key, signal.shape, signal.dtype)
+        return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)
+
+
+class DeclaredReadNoise(OwnReadNoise):
+    scaled_by: ClassVar[tuple[str, ...]] = ("read_noise_scale",)
+
+
+def test_a_scale_that_is_used_must_be_declared():
+    """Unscaled noise would be wrong without a word."""
+    differ = CAMERA.remove("read_noise").add(hsnoise.effects.ReadNoiseNonuniformity(0.5))
+    with pytest.raises(TypeError, match=r'capture.read_noise_scale: .* scaled_by = \("read_noise_scale",\)'):
+        hsnoise.sample_dark(jax.random.key(1), 2, (32, 48), differ.add(OwnReadNoise(30.0)))
+    drawn = hsnoise.sample_dark(jax.random.key(1), 400, (32, 48), differ.add(DeclaredReadNoise(30.0)), exposure_s=0.0)
+    noise = np.log(np.std(np.asarray(drawn, float), axis=0))
+    assert noise.std() > 0.3  # 0.04 by chance
+
+
 @pytest.mark.parametrize(
     ("attribute", "value", "message"),
     [
