@@ -20,7 +20,7 @@ from hsnoise.fitting.pixel_result import followed, result_of
 from hsnoise.fitting.problem import check_named
 from hsnoise.fitting.profile import profile_errors
 from hsnoise.fitting.result import FitResult, Method, Status
-from hsnoise.fitting.simulated import fit_synthetic
+from hsnoise.fitting.simulated import draft_synthetic
 from hsnoise.frames.arguments import check_no_copies
 from hsnoise.frames.mosaics import warn_of_a_mosaic
 from hsnoise.frames.source import as_stack
@@ -208,7 +208,7 @@ def _with_effects(stack, model: NoiseModel, extra: tuple[str, ...], method: str,
     for name in extra:
         bare = bare.remove(name)
     base = fit(stack, model=bare, method=method, pixels=pixels, progress=progress)
-    return fit_synthetic(base, portion, model)
+    return draft_synthetic(base, portion, model).finished()
 
 
 def rechecked(result: FitResult, stack) -> FitResult:

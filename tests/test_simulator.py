@@ -14,7 +14,7 @@ from hsnoise import effects as fx
 from hsnoise.criticism.compare import compared
 from hsnoise.criticism.diagnose import diagnosed
 from hsnoise.criticism.held_out import Judge
-from hsnoise.fitting.simulated import fit_synthetic
+from hsnoise.fitting.simulated import draft_synthetic
 from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation import portion as cutting
@@ -113,7 +113,7 @@ def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
     portion = Portion.of(real(5, truth, empty_stack(6, (32, 48))))
     base = hsnoise.fit(portion.frames, model=MODEL, pixels="alike")
     tuned = keys_of(lambda: diagnosed(MODEL, portion, draws=16, seed=0, tick=lambda: None))
-    refitted = keys_of(lambda: fit_synthetic(base, portion, base.params.add(fx.RowNoise(3.0))))
+    refitted = keys_of(lambda: draft_synthetic(base, portion, base.params.add(fx.RowNoise(3.0))).finished())
     judged = keys_of(lambda: compared(truth, portion, draws=8, seed=0))
     unseen = keys_of(lambda: Judge(portion, True, 0).score(truth))
     for one, other in combinations([tuned, refitted, judged, unseen], 2):

@@ -11,7 +11,7 @@ from hsnoise import effects as fx
 from hsnoise.effects import RowNoise
 from hsnoise.fitting.covariances import as_scattered, not_surer_than
 from hsnoise.fitting.problem import Problem
-from hsnoise.fitting.simulated import LAST_DRAWS, MOST_ITERATIONS, SHORT_STEP, _search, fit_synthetic
+from hsnoise.fitting.simulated import LAST_DRAWS, MOST_ITERATIONS, SHORT_STEP, _search, draft_synthetic
 from hsnoise.likelihood.parameters import parameters_of
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.simulator import Simulator
@@ -93,7 +93,7 @@ def test_only_what_the_base_fit_does_not_know_is_held_in_place(hidden):
 def test_base_parameters_that_the_effect_had_moved_come_back(hidden):
     stack, base = hidden
     assert abs(base.table["row_gain.sigma.B"][0] - 0.114) > 0.03  # the row noise passes for row gain
-    fit = fit_synthetic(base, Portion.of(stack), base.params.add(RowNoise(1.4)))
+    fit = draft_synthetic(base, Portion.of(stack), base.params.add(RowNoise(1.4))).finished()
     for name, (value, _, _) in TRUTH.table.items():
         found, error, _ = fit.table[name]
         assert abs(found - value) <= 4 * error, f"{name}: {found} +- {error}, truth {value}"

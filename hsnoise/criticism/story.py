@@ -244,7 +244,7 @@ def _because(before: Step, after: Step) -> str:
 
 
 def moved(before: FitResult, after: FitResult) -> tuple[str, ...]:
-    """Base parameters that changed by more than their errors from one fit to another, in words."""
+    """Base parameters that changed by more than two standard errors from one fit to another, in words."""
     found = []
     for name in before.names:
         (old, error, unit), (new, new_error, _) = before.table[name], after.table[name]

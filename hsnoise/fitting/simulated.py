@@ -39,22 +39,6 @@ SURE_STEP = 2.0  # after a shorter step the derivatives are still accurate enoug
 STEP_SIGMA, STEP_LOG = 2.0, 0.2  # of derivatives: in standard errors; for effects at most this in the logarithm
 
 
-def fit_synthetic(
-    base: FitResult,
-    portion: Portion,
-    model: NoiseModel,
-    *,
-    seed: int = 0,
-    tick: Callable[[], None] = lambda: None,
-) -> FitResult:
-    """`base` with the effects of `model` that it lacks, and base parameters corrected for them.
-
-    base: fit of the same capture without those effects. model: its values start the search for the effects.
-    Raises RuntimeError if the statistics of the model's draws are not finite.
-    """
-    return draft_synthetic(base, portion, model, seed=seed, tick=tick).finished()
-
-
 def draft_synthetic(
     base: FitResult,
     portion: Portion,
@@ -63,7 +47,13 @@ def draft_synthetic(
     seed: int = 0,
     tick: Callable[[], None] = lambda: None,
 ) -> Draft:
-    """`fit_synthetic` without its end, which takes almost half of the draws."""
+    """`base` with the effects of `model` that it lacks, and base parameters corrected for them, but for its end.
+
+    That end, `Draft.finished`, takes almost half of the draws.
+
+    base: fit of the same capture without those effects. model: its values start the search for the effects.
+    Raises RuntimeError if the statistics of the model's draws are not finite.
+    """
     extra = tuple(name for name in model.names if name not in base.params)
     whole = reduce(NoiseModel.add, (model[name] for name in extra), base.params)
     problem = Problem(portion, base, whole, extra, model)
