@@ -14,9 +14,13 @@ GAIN, READ_E, BLACK_DN, SHAPE, WARM, CHARGE_E, SLOW_E = 2.2, 16.0, 105.0, (192, 
 
 
 class Ccd:
-    """Read noise that clips at 0 in 0.2 % of the counts, warm pixels in bias frames, row noise of slow rows."""
+    """Read noise that clips at 0 in 0.2 % of the counts, warm pixels in bias frames, row noise of slow rows.
 
-    def __init__(self, seed=0, exponent=1.5):
+    growth: of the warm pixels' charge in a second, relative to that of a bias frame.
+    """
+
+    def __init__(self, seed=0, exponent=1.5, growth=0.0):
+        self.growth = growth
         self.rng = np.random.default_rng(seed)
         hot = self.rng.random(SHAPE) < WARM
         self.warm_e = np.where(hot, self.rng.exponential(CHARGE_E, SHAPE), 0.0)
@@ -28,19 +32,19 @@ class Ccd:
         series = np.fft.irfft(white * self.slow, SHAPE[0], axis=1)
         return SLOW_E * series / np.sqrt((series**2).mean())
 
-    def frames(self, n, light_e=0.0):
-        electrons = self.rng.poisson(self.warm_e + light_e, (n, *SHAPE)) + READ_E * self.rng.standard_normal(
-            (n, *SHAPE)
-        )
+    def frames(self, n, light_e=0.0, exposure_s=0.0):
+        charge_e = self.warm_e * (1 + self.growth * exposure_s) + light_e
+        electrons = self.rng.poisson(charge_e, (n, *SHAPE)) + READ_E * self.rng.standard_normal((n, *SHAPE))
         return np.clip(np.rint(BLACK_DN + GAIN * (electrons + self.rows(n)[:, :, None])), 0, 65535).astype(np.uint16)
 
-    def stack(self):
+    def stack(self, dark_s=0.0, flats_s=(1.0, 4.0)):
         # Light falls to a hundredth in a corner: a spectrograph's slit, a small lens.
         y, x = np.meshgrid(np.linspace(0, 1, SHAPE[0]), np.linspace(0, 1, SHAPE[1]), indexing="ij")
         self.light_e = 8000 * np.clip(1.2 - np.hypot(x - 0.3, y - 0.4), 0.01, 1)
-        groups = [self.frames(8), *(self.frames(4, f * self.light_e) for f in (0.25, 1.0))]
+        lit = [self.frames(4, f * self.light_e, t) for f, t in zip((0.25, 1.0), flats_s, strict=True)]
+        groups = [self.frames(8, exposure_s=dark_s), *lit]
         return hsnoise.FrameStack(
-            groups, (0.0, 1.0, 4.0), kind=("dark", "flat", "flat"), white_level=65535, shutter="global"
+            groups, (dark_s, *flats_s), kind=("dark", "flat", "flat"), white_level=65535, shutter="global"
         )
 
 
@@ -70,6 +74,19 @@ def test_warm_pixels_of_bias_frames_are_in_the_model(ccd):
     mean = np.mean([frame.mean() for frame in stack.frames(0)])
     charge = fit.table["hot_pixels.fraction"][0] * fit.table["hot_pixels.at_readout"][0]
     assert fit.table["black_level"][0] + GAIN * charge == pytest.approx(mean, abs=0.3)
+
+
+def test_warm_pixels_whose_charge_does_not_grow_in_flats_are_charge_of_the_readout(ccd):
+    _, _, fit = ccd
+    assert float(fit.params["hot_pixels"].rate) == 0
+
+
+@pytest.mark.parametrize(("dark_s", "at_readout_e"), [(0.0, CHARGE_E), (2.0, CHARGE_E)])
+def test_flats_tell_how_the_charge_of_warm_pixels_grows(dark_s, at_readout_e):
+    growth = 3.0
+    fit = hsnoise.fit(Ccd(1, growth=growth).stack(dark_s))
+    within(fit, "hot_pixels.rate", growth * CHARGE_E, 0.1)
+    within(fit, "hot_pixels.at_readout", at_readout_e, 0.1)
 
 
 def test_rows_that_are_not_white_have_an_exponent(ccd):

@@ -9,6 +9,7 @@ from hsnoise.fitting.pixel_flats import of_colours, weighted_mean
 from hsnoise.statistics.pixels.population import Population
 
 FANO_SIGMAS = 3.0  # standard errors below 1 at which hot pixels count as sub-Poisson
+GROWS = 3.0  # standard errors from which the charge of warm pixels grows with exposure, and has a part that does not
 
 
 def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, dict[str, tuple[float, float]]]:
@@ -29,7 +30,11 @@ def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, d
 
 
 def warm_of(pixel: PixelFit, gain: np.ndarray, exposure_s: float) -> dict[str, dict[str, tuple[float, float]]]:
-    """Hot pixels from repeated darks of one exposure: charge of the exposure, or of the readout if that is zero."""
+    """Hot pixels from repeated darks of one exposure.
+
+    Flats may tell how much of their charge is that of the readout; else it is all of it in darks of 0 s, and none in
+    others.
+    """
     many = [(c.warm, g) for c, g in zip(pixel.channels, gain, strict=True) if c.warm is not None]
     if not many:
         return {}
@@ -37,6 +42,12 @@ def warm_of(pixel: PixelFit, gain: np.ndarray, exposure_s: float) -> dict[str, d
     charge = of_colours([(warm.extra_dn[0] / g, warm.extra_dn[1] / g) for warm, g in many])
     tail = of_colours([warm.spread for warm, _ in many])
     hot = {"fraction": fraction} | ({"spread": tail} if tail[0] > 0 else {})
+    told = [warm.growth for warm, _ in many if np.isfinite(warm.growth[1])]
+    growth, error = weighted_mean(told) if told else (0.0, np.inf)
+    at_readout = 1 - growth * exposure_s
+    if growth > GROWS * error and (at_readout > GROWS * error * exposure_s or exposure_s == 0):
+        rate = charge[0] * growth, float(np.hypot(charge[1] * growth, charge[0] * error))
+        return {"hot_pixels": {**hot, "rate": rate, "at_readout": (charge[0] * at_readout, charge[1] * at_readout)}}
     if exposure_s > 0:
         return {"hot_pixels": {**hot, "rate": (charge[0] / exposure_s, charge[1] / exposure_s)}}
     return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}

@@ -34,6 +34,7 @@ from hsnoise.fitting.pixel_patterns import (
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
 from hsnoise.fitting.pixel_response import STRAIGHT, Bend, bend_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, column_spectrum, row_gain_of_darks, row_spectrum
+from hsnoise.fitting.pixel_warm import warm_in
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
@@ -45,7 +46,7 @@ from hsnoise.statistics.pixels.glow import Glow, glow_of, glow_of_pixels, withou
 from hsnoise.statistics.pixels.hits import Rays, rays_of
 from hsnoise.statistics.pixels.jump_search import Jumps
 from hsnoise.statistics.pixels.jumps import jumps_of
-from hsnoise.statistics.pixels.population import Population, Warm, population_of, warm_of
+from hsnoise.statistics.pixels.population import Population, Warm, population_of
 from hsnoise.statistics.pixels.read_noise import NoiseSpread, Tail, noise_spread_of, tail_of
 from hsnoise.statistics.pixels.row_groups import RowGroups
 from hsnoise.statistics.pixels.sample import without_outliers
@@ -223,7 +224,7 @@ def _channel(
     shading = shadings_of(found, c, (spectrum.widened, of_columns.widened))
     lines = lines_in(found, c, shading)
     offset = offset_of(found, c, population)
-    warm = _warm(found, c) if is_plain and not found.has_exposures else None
+    warm = warm_in(found, c) if is_plain and not found.has_exposures else None
     if pixels is not None:
         black = black_of_pixels(pixels.calm()), black[1]
     # Hot pixels with a population of their own would raise the mean: black is the level of the typical pixel then.
@@ -323,12 +324,6 @@ def _without_rows_of(ringing: Ringing, channel: Channel, planes: list[Plane]) ->
     extra = shared_by_row(ringing, len(planes[0].column_mean_dn), step) * max(channel.values[1] - ROUNDING, 0.0)
     variance, *errors = channel.patterns["row_noise"]
     return replace(channel, patterns={**channel.patterns, "row_noise": (variance - extra, *errors)})
-
-
-def _warm(found: Survey, c: int) -> Warm | None:
-    if found.shortest is None:
-        return None
-    return warm_of(found.shortest.pixels(c, "level_dn"), len(shortest_of(found, c)[0].column_mean_dn))
 
 
 def _flat_gain(found: Survey, summary: Summary) -> FlatGain | None:

@@ -197,14 +197,14 @@ def _variance(levels: list[Level], sound: list[np.ndarray], black_dn: float, row
         most = max(most, int(lit.sum()) * (side - 1) ** 2)
     if not found:
         return 0.0, np.inf
-    between = _between(*np.array(found).T)
+    scatter = between(*np.array(found).T)
     # Variances, not their roots, are averaged: a root of what may be negative is too large on average.
-    mean, error = weighted_mean([(of, float(np.hypot(error, between))) for of, error in found])
+    mean, error = weighted_mean([(of, float(np.hypot(error, scatter))) for of, error in found])
     # All levels show the same pixels: more of them do not make up for how few these are.
     return mean, max(error, abs(mean) * float(np.sqrt(2 / most)))
 
 
-def _between(values: np.ndarray, errors: np.ndarray) -> float:
+def between(values: np.ndarray, errors: np.ndarray) -> float:
     """Standard deviation of what differs between values with these errors; 0 unless they contradict each other.
 
     Reference: Paule, Mandel, "Consensus values and weighting factors", J. Research NBS 87 (1982).

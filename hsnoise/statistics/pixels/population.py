@@ -120,24 +120,30 @@ def population_of(
 
 
 class Warm(NamedTuple):
-    """Warm pixels of one exposure, each value with its error: their share, and mean and spread of their extra level."""
+    """Warm pixels of one exposure, each value with its error: their share, and mean and spread of their extra level.
+
+    growth: of that level in a second, relative to it; infinite error: charge of the exposure cannot be distinguished
+    from charge of the readout.
+    """
 
     fraction: tuple[float, float]
     extra_dn: tuple[float, float]
     spread: tuple[float, float]
+    growth: tuple[float, float] = (0.0, np.inf)
 
 
-def warm_of(halves: np.ndarray, columns: int) -> Warm | None:
-    """The warm pixels of one exposure; None where there are none.
-
-    halves [half, pixel]: levels of pixels in rows of `columns`. What neighbours share, such as shading, is not an extra
-    level, nor what a whole column has: the first ones that an output reads may lie far off. Without a second exposure,
-    charge of the exposure cannot be distinguished from charge of the readout.
-    """
-    off = np.stack([half - of_neighbours(half, columns) for half in halves]).astype(np.float64)
+def beyond_neighbours(levels: np.ndarray, columns: int) -> np.ndarray:
+    """Levels [..., pixel] of pixels in rows of `columns`, less what neighbours share, such as shading, and less what a
+    whole column has: the first ones that an output reads may lie far off."""
+    off = np.stack([one - of_neighbours(one, columns) for one in levels]).astype(np.float64)
     of_column = off.mean(0).reshape(-1, columns)
     if len(of_column) >= MANY_ROWS:
         off -= np.tile(np.median(of_column, axis=0), len(of_column))
+    return off
+
+
+def warm_of(off: np.ndarray) -> Warm | None:
+    """The warm pixels of one exposure; None where there are none. off [half, pixel]: levels `beyond_neighbours`."""
     extra = off.mean(0) - np.median(off.mean(0))
     noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
