@@ -22,11 +22,15 @@ def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, d
         "rate": of_colours([(p.hot_rate[0] / g, p.hot_rate[1] / g) for p, g in hot]),
         "at_readout": of_colours([(p.at_readout[0] / g, p.at_readout[1] / g) for p, g in hot]),
     }
-    heavy = [p.hot_spread for p, _ in hot if p.hot_spread[0] > 0]
-    if 2 * len(heavy) > len(hot):
-        found["spread"] = of_colours(heavy)
+    found |= of_most("spread", [p.hot_spread for p, _ in hot])
     fano = _fano(pixel)
     return {"hot_pixels": found if fano is None else found | {"fano": fano}}
+
+
+def of_most(name: str, pairs: list[tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """A shape of the distribution by its name, if most colours have one: mean over those colours."""
+    heavy = [pair for pair in pairs if pair[0] > 0]
+    return {name: of_colours(heavy)} if 2 * len(heavy) > len(pairs) else {}
 
 
 def warm_of(pixel: PixelFit, gain: np.ndarray, exposure_s: float) -> dict[str, dict[str, tuple[float, float]]]:

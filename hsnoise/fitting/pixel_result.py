@@ -41,7 +41,7 @@ from hsnoise.effects import (
     TapGains,
     TapOffsets,
 )
-from hsnoise.fitting.pixel_defects import hot_of, jumps_of, rays_of, warm_of
+from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_most, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, bends_of, of_colours
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
@@ -221,7 +221,7 @@ def _population(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
     if spread[0] > THERE * spread[1]:
-        found["dark_current_nonuniformity"] = {"spread": spread}
+        found["dark_current_nonuniformity"] = {"spread": spread, **of_most("tail", [p.tail for p, _ in many])}
     return found | hot_of(pixel, many)
 
 

@@ -1,17 +1,20 @@
 """How pixels differ: the distributions of dark current and offsets over pixels, without the noise of estimation.
 
-Dark current is modelled like the effects that draw it: log-normal (`dark_current_nonuniformity`), with an exponential
-extra in a fraction of pixels (`hot_pixels`), whose mean may be log-normal as well. It is fitted to the measured growth
-of all pixels by maximum likelihood, with the known noise of a pixel's growth as part of the distribution. Offsets are
-normal; their variance is the covariance of two halves of the frames, which noise does not enter.
+Dark current is modelled like the effects that draw it: log-normal, with a tail of a power law where it shows
+(`dark_current_nonuniformity`), and an exponential extra in a fraction of pixels (`hot_pixels`), whose mean may be
+log-normal as well. It is fitted to the measured growth of all pixels by maximum likelihood, with the known noise of a
+pixel's growth as part of the distribution. Offsets are normal; their variance is the covariance of two halves of the
+frames, which noise does not enter.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.laguerre import laggauss
 from scipy.optimize import minimize
 from scipy.special import erfcx, ndtr
 
@@ -19,9 +22,15 @@ from hsnoise._core.quadrature import normal_nodes
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
 from hsnoise.statistics.pixels.sample import of_neighbours
 
+Loss = Callable[[np.ndarray], float]
+
+TAIL, FRACTION, HOT_SPREAD = 2, 3, 5  # places in the vector of numbers that is fitted
+ABSENT, STARTS = -np.inf, {TAIL: np.log(0.1), HOT_SPREAD: np.log(0.5)}  # of logarithms
+QUICK = (400,)  # iterations
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
-TAIL_NODES, MOST_TAIL = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
+HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
+TAIL_NODES, MOST_TAIL = 12, 0.45  # over the exponential part of the logarithm; its largest mean
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
 APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by more, it is a hit or a jump
@@ -42,7 +51,8 @@ class Population:
 
     Attributes:
         mean: of ordinary pixels, independent of the limit above which pixels are called hot.
-        spread: of ln dark current of ordinary pixels (0: they do not differ).
+        spread: of ln dark current of ordinary pixels (0: they do not differ), beside an exponential part of mean `tail`
+            (0: none).
         hot_fraction, hot_rate: share of hot pixels (0: none), and mean of their extra dark current, such that
             the mean over all pixels is the measured one; hot_spread: of ln mean over hot pixels (0: exponential).
         at_readout: mean extra charge of hot pixels that is independent of exposure, DN.
@@ -53,6 +63,7 @@ class Population:
 
     mean: float
     spread: tuple[float, float]
+    tail: tuple[float, float]
     hot_fraction: tuple[float, float]
     hot_rate: tuple[float, float]
     hot_spread: tuple[float, float]
@@ -86,8 +97,8 @@ def population_of(
     fallen = min(float(np.median(growth)), 0.0)
     values, errors = _fitted(growth - fallen, noise)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
-        values[2:], errors[2:] = 0.0, np.inf
-    body, spread, fraction, rate, tail = values
+        values[3:], errors[3:] = 0.0, np.inf
+    body, spread, tail, fraction, rate, hot_spread = values
     below = float(growth[growth < limit - pedestal_dn_per_s].mean())
     beyond = 0.0
     if fraction > 0:
@@ -95,24 +106,25 @@ def population_of(
         beyond = body - _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
     total = float(growth.mean())
     if fraction > 0 and total <= below + beyond:  # the log-normal's tail holds more than all pixels have
-        fraction = values[2] = 0.0
-        errors[2:] = np.inf
+        fraction = values[3] = 0.0
+        errors[3:] = np.inf
     if fraction <= 0:
         beyond = total - below if spread > 0 else 0.0
     mean = ordinary + beyond
     if fraction > 0:  # keeps the charge of the tail, whatever its shape; moving pedestals are in both means
         scatter = float(growth.std()) / np.sqrt(len(growth))
         rate = max((total - below - beyond) / fraction, 0.0)
-        errors[3] = max(errors[3], np.hypot(scatter / fraction, rate * errors[2] / fraction))
+        errors[4] = max(errors[4], np.hypot(scatter / fraction, rate * errors[3] / fraction))
     shortest = float(pixels.exposure_s.min())
     return Population(
         mean=mean,
         spread=(spread, errors[1]),
-        hot_fraction=(fraction, errors[2]),
-        hot_rate=(rate, errors[3]),
-        hot_spread=(tail, errors[4]),
+        tail=(tail, errors[2]),
+        hot_fraction=(fraction, errors[3]),
+        hot_rate=(rate, errors[4]),
+        hot_spread=(hot_spread, errors[5]),
         at_readout=_at_readout(pixels, halves, noise, rate),
-        offset_sigma=offset_sigma(pattern, spread * body * shortest, low_side_dn),
+        offset_sigma=offset_sigma(pattern, _width(spread, tail) * body * shortest, low_side_dn),
         median=float(np.median(growth)),
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
@@ -149,9 +161,9 @@ def warm_of(off: np.ndarray) -> Warm | None:
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
         return None
     values, errors = _fitted(extra, noise)
-    if values[2] <= 0:
+    if values[3] <= 0:
         return None
-    return Warm(*((float(values[i]), float(errors[i])) for i in (2, 3, 4)))
+    return Warm(*((float(values[i]), float(errors[i])) for i in (3, 4, 5)))
 
 
 def _hot_again(halves: np.ndarray, limit: float) -> bool:
@@ -174,30 +186,54 @@ def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
 
 
 def growth_cdf(
-    x: np.ndarray, noise: float, mean: float, spread: float, fraction: float, rate: float, tail: float = 0.0
+    x: np.ndarray,
+    noise: float,
+    mean: float,
+    spread: float,
+    tail: float,
+    fraction: float,
+    rate: float,
+    hot_spread: float = 0.0,
 ) -> np.ndarray:
     """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise.
 
-    tail: standard deviation of ln of the exponential's mean over pixels.
+    tail: mean of an exponential part of ln growth; hot_spread: standard deviation of ln of the hot pixels' mean.
     """
+    width = mean * _width(spread, tail)
+    plain = _wide_noise(x, noise, mean, spread, tail) if noise > WIDE * width else _narrow(x, noise, mean, spread, tail)
+    if fraction <= 0:
+        return plain
+    # Next to so wide an extra, the ordinary part of hot pixels can be taken as normal.
+    width = float(np.hypot(noise, width))
+    z, weight = normal_nodes(HOT_NODES) if hot_spread > 0 else (np.zeros(1), np.ones(1))
+    off = (x[:, None] - mean) / width
+    warm = ndtr(off) - _exponential_share(off, width / (rate * np.exp(hot_spread * z - hot_spread**2 / 2)))
+    return (1 - fraction) * plain + fraction * (warm @ weight)
+
+
+def _wide_noise(x: np.ndarray, noise: float, mean: float, spread: float, tail: float) -> np.ndarray:
+    """Share of ordinary pixels below x, by nodes over their dark currents."""
     z, weight = normal_nodes(NODES)
     body = mean * np.exp(spread * z - spread**2 / 2)
-    off = (x[:, None] - body) / noise
-    if noise > WIDE * spread * mean:
-        plain = ndtr(off) @ weight
-    else:  # narrow noise would leave steps between the nodes of the log-normal distribution
-        left = np.maximum(x[:, None] - noise * z, 1e-300) / mean
-        plain = ndtr(np.log(left) / spread + spread / 2) @ weight
-    if fraction > 0 and tail > 0:  # next to so wide an extra, the ordinary part of hot pixels can be taken as normal
-        width = np.hypot(noise, spread * mean)
-        z, weight = normal_nodes(TAIL_NODES)
-        off = (x[:, None] - mean) / width
-        warm = (ndtr(off) - _exponential_share(off, width / (rate * np.exp(tail * z - tail**2 / 2)))) @ weight
-        plain = (1 - fraction) * plain + fraction * warm
-    elif fraction > 0:
-        warm = (ndtr(off) - _exponential_share(off, noise / rate)) @ weight
-        plain = (1 - fraction) * plain + fraction * warm
-    return plain
+    if tail > 0:
+        more, of_more = laggauss(TAIL_NODES)
+        body = (body[:, None] * (1 - tail) * np.exp(tail * more)).ravel()
+        weight = (weight[:, None] * of_more).ravel()
+    return ndtr((x[:, None] - body) / noise) @ weight
+
+
+def _narrow(x: np.ndarray, noise: float, mean: float, spread: float, tail: float) -> np.ndarray:
+    """The same by nodes over the noise: narrow noise would leave steps between those over the dark currents."""
+    z, weight = normal_nodes(NODES)
+    left = np.maximum(x[:, None] - noise * z, 1e-300) / (mean * (1 - tail))
+    off = np.log(left) / spread + spread / 2
+    below = ndtr(off) if tail <= 0 else ndtr(off) - _exponential_share(off, spread / tail)
+    return below @ weight
+
+
+def _width(spread: float, tail: float) -> float:
+    """Standard deviation of the dark current of ordinary pixels, relative to its mean."""
+    return float(np.sqrt(np.exp(spread**2) * (1 - tail) ** 2 / (1 - 2 * tail) - 1))
 
 
 def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
@@ -209,18 +245,19 @@ def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray
 
 
 def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """(mean, spread, fraction, rate, tail) of the growth [pixel], and errors; zeros for what is not significant."""
+    """(mean, spread, tail, fraction, rate, hot spread) of the growth [pixel], and errors; zeros for what is not
+    significant."""
     middle = float(np.median(growth))
     core = 1.4826 * float(np.median(np.abs(growth - middle)))
     if core <= 0:
-        return np.array([max(middle, 0.0), 0.0, 0.0, 0.0, 0.0]), np.full(5, np.inf)
+        return np.array([max(middle, 0.0), *np.zeros(5)]), np.full(6, np.inf)
     far = max(growth.max() - middle, 12 * core)
     edges = middle + np.append(np.linspace(-6 * core, 6 * core, CORE_BINS), np.geomspace(6.2 * core, far, TAIL_BINS))
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
     def natural(theta: np.ndarray) -> tuple[float, ...]:
         if middle <= 0:  # ordinary pixels have no dark current that could differ
-            theta = np.array([0.0, np.log(1e-3), *theta[2:]])
+            theta = np.array([0.0, np.log(1e-3), ABSENT, *theta[3:]])
         return _natural(theta, core)
 
     def loss(theta: np.ndarray) -> float:
@@ -230,76 +267,87 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     excess = growth[growth > middle + 6 * core] - middle
     rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
     share = float(np.clip(len(excess) / len(growth), 1e-5, 0.1))
-    theta = np.array([middle / core, np.log(0.2), np.log(share / (MOST_HOT - share)), np.log(rate / core)])
-    theta = _least(loss, theta)
-    if len(excess) >= FEWEST_IN_TAIL:
-        theta = _with_tail(loss, theta)
-    cool = _refit(loss, np.append(theta[:2], [COOL, theta[3]]), 2)
+    start = [middle / core, np.log(0.2), ABSENT, np.log(share / (MOST_HOT - share)), np.log(rate / core), ABSENT]
+    shapes = [TAIL] * (middle > 0) + [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
+    theta = _likeliest(loss, np.array(start), shapes)
+    cool = _least(loss, np.append(theta[:FRACTION], [COOL, theta[4], ABSENT]), (FRACTION, 4), QUICK)
     found = natural(theta)
     there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
     # Many pixels that are hardly warmer than the others are their tail, not hot pixels.
-    if not there or found[3] < HOT_FROM * found[0] or found[2] > 0.95 * MOST_HOT:
+    if not there or found[4] < HOT_FROM * found[0] or found[3] > 0.95 * MOST_HOT:
         theta = cool
     values = np.array(natural(theta))
-    units = np.array([core, values[1], values[2] * (1 - values[2] / MOST_HOT), values[3], values[4]])
-    errors = np.append(_errors(loss, theta), np.full(5 - len(theta), np.inf)) * np.where(units > 0, units, 1.0)
-    if len(theta) > 4 and theta[4] >= MOST_TAIL:
-        errors[4] = 0.0  # held there
+    units = np.array([core, values[1], values[2], values[3] * (1 - values[3] / MOST_HOT), values[4], values[5]])
+    errors = _errors(loss, theta) * np.where(units > 0, units, 1.0)
+    if theta[HOT_SPREAD] >= MOST_HOT_SPREAD:
+        errors[HOT_SPREAD] = 0.0  # held there
     if theta is cool:
-        values[2:], errors[2:] = 0.0, np.inf
-    alike = theta.copy()
-    alike[1] = np.log(1e-3)
-    if values[1] < LEAST_SPREAD or 2 * (loss(_refit(loss, alike, 1)) - loss(theta)) < SIGNIFICANT:
-        values[1], errors[1] = 0.0, max(values[1], errors[1])
+        values[3:], errors[3:] = 0.0, np.inf
+    alike = _least(loss, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,), QUICK)
+    if (values[1] < LEAST_SPREAD and values[2] <= 0) or 2 * (loss(alike) - loss(theta)) < SIGNIFICANT:
+        values[1:3], errors[1:3] = 0.0, np.maximum(values[1:3], errors[1:3])
     return values, errors
 
 
-def _with_tail(loss, theta: np.ndarray) -> np.ndarray:
-    """The numbers with a tail heavier than exponential, if that is significant, else as they are."""
-    heavy = _least(loss, np.append(theta, np.log(0.5)))
-    return heavy if 2 * (loss(theta) - loss(heavy)) > SIGNIFICANT else theta
+def _likeliest(loss: Loss, plain: np.ndarray, shapes: list[int]) -> np.ndarray:
+    """The numbers that are likeliest, with those of `shapes` that make them significantly likelier."""
+    found = [_least(loss, plain)]
+    for of in shapes:
+        found += [_least(loss, np.where(np.arange(len(plain)) == of, STARTS[of], theta)) for theta in found]
+    return min(found, key=lambda theta: 2 * loss(theta) + SIGNIFICANT * len(_free(theta)))
 
 
-def _least(loss, theta: np.ndarray) -> np.ndarray:
-    """The numbers with the lowest loss, starting from `theta`."""
-    for _ in range(2):  # restarts, because the simplex may have shrunk too early
-        theta = minimize(loss, theta, method="Nelder-Mead", options={"maxiter": 800, "xatol": 1e-4, "fatol": 0.02}).x
-    return theta
+def _least(
+    loss: Loss, theta: np.ndarray, held: tuple[int, ...] = (), iterations: tuple[int, ...] = (800, 800)
+) -> np.ndarray:
+    """The numbers with the lowest loss, starting from `theta`.
 
-
-def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
-    """Mean, spread, fraction, rate and tail from unconstrained numbers in units of the core's width."""
-    fraction = MOST_HOT / (1 + np.exp(-np.clip(theta[2], -40, 40)))
-    rate = core * float(np.exp(np.clip(theta[3], -12, 12)))
-    tail = float(np.exp(np.clip(theta[4], -4, MOST_TAIL))) if len(theta) > 4 else 0.0
-    return core * max(float(theta[0]), 1e-3), float(np.exp(np.clip(theta[1], -12, 1.2))), float(fraction), rate, tail
-
-
-def _refit(loss, theta: np.ndarray, held: int) -> np.ndarray:
-    """The numbers with the lowest loss, one of them fixed."""
-    free = [i for i in range(len(theta)) if i != held]
+    iterations: of each restart, because the simplex may have shrunk too early.
+    """
+    free = [i for i in _free(theta) if i not in held]
 
     def whole(some: np.ndarray) -> np.ndarray:
         out = theta.copy()
         out[free] = some
         return out
 
-    options = {"maxiter": 400, "fatol": 0.05}
-    return whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
+    for most in iterations:
+        options = {"maxiter": most, "xatol": 1e-4, "fatol": 0.02}
+        theta = whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
+    return theta
 
 
-def _errors(loss, theta: np.ndarray) -> np.ndarray:
-    """Standard errors from the curvature of the loss; infinite where it is flat."""
-    n, step = len(theta), 0.02
+def _free(theta: np.ndarray) -> list[int]:
+    """Which numbers are there."""
+    return list(np.flatnonzero(theta != ABSENT))
+
+
+def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
+    """Mean, spread, tail, fraction, rate and hot spread from unconstrained numbers in units of the core's width."""
+    fraction = MOST_HOT / (1 + np.exp(-np.clip(theta[FRACTION], -40, 40)))
+    rate = core * float(np.exp(np.clip(theta[4], -12, 12)))
+    tail, hot_spread = (
+        min(float(np.exp(theta[TAIL])), MOST_TAIL),
+        float(np.exp(min(theta[HOT_SPREAD], MOST_HOT_SPREAD))),
+    )
+    spread = float(np.exp(np.clip(theta[1], -12, 1.2)))
+    return core * max(float(theta[0]), 1e-3), spread, tail, float(fraction), rate, hot_spread
+
+
+def _errors(loss: Loss, theta: np.ndarray) -> np.ndarray:
+    """Standard errors from the curvature of the loss; infinite where it is flat, and of numbers that are not there."""
+    free, step = _free(theta), 0.02
+    n, out = len(free), np.full(len(theta), np.inf)
     hessian = np.empty((n, n))
-    unit = step * np.eye(n)
+    unit = step * np.eye(len(theta))[free]
     for i in range(n):
         for j in range(i, n):
             parts = [loss(theta + a * unit[i] + b * unit[j]) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
             hessian[i, j] = hessian[j, i] = (parts[0] - parts[1] - parts[2] + parts[3]) / (4 * step**2)
     values, vectors = np.linalg.eigh(hessian)
     variance = (vectors**2 / np.maximum(values, 1e-9)) @ np.ones(n)
-    return np.sqrt(np.minimum(variance, 1e6))
+    out[free] = np.sqrt(np.minimum(variance, 1e6))
+    return out
 
 
 def offset_sigma(pattern: np.ndarray, dark_sigma_dn: float, low_side_dn: float) -> tuple[float, float]:
