@@ -32,7 +32,9 @@ LAST_DRAWS, LAST_SLOPES = 32, 6  # at the end; noise in the slopes of few draws 
 SCATTER_DRAWS, SCATTER_FROM = 32, 1000  # draws for the weights; numbered apart from those for the means
 MOST_SLOPES, MOST_ITERATIONS = 4, 20
 SLOPE_NOISE = 8.0  # a slope of fewer standard errors than the root of this counts as zero
-SLACK, MUCH_LESS = 0.02, 0.5  # of the cost: tolerated rise (rare counts make it rough), fall if derivatives are good
+SLACK = 0.02  # of the cost: tolerated rise, as rare counts make it rough
+STUCK, FAR = 6, 4.0  # steps without a fall by more, while the cost is so many times that of the model's own draws
+AS_FORESEEN = 0.5  # share of the fall of the cost that derivatives foresee; if it falls less, they are not accurate
 LEAST_DAMPING = 0.1  # of the information, after a failed step
 SHORT_STEP, LONG_STEP = 0.2, 1.0  # last step in standard errors: below, the search ends; above, it has failed
 SURE_STEP = 2.0  # after a shorter step the derivatives are still accurate enough
@@ -193,9 +195,9 @@ def _search(problem: Problem, simulator: Simulator) -> Draft:
     Statistics that are far off count less (Huber), so that what the model still lacks does not bias the rest.
     """
     yard = _Yardstick.of(problem, simulator, problem.start)
-    here, damping, taken, wanted, fresh, iterations = _first(problem, yard), 0.0, 0, True, False, 0
+    here, damping, taken, wanted, fresh, iterations, still = _first(problem, yard), 0.0, 0, True, False, 0, 0
     by = np.where(np.arange(len(here.y)) < len(problem.centre), STEP_SIGMA, STEP_LOG)
-    while iterations < MOST_ITERATIONS:
+    while iterations < MOST_ITERATIONS and still < STUCK:
         iterations += 1
         share = share_of_far(here.off)
         weight = _weighted(yard.equal, share)
@@ -217,10 +219,13 @@ def _search(problem: Problem, simulator: Simulator) -> Draft:
             break
         there = yard.point(ahead)
         before, after = here.cost(weight, problem), there.cost(weight, problem)
+        foreseen = replace(there, off=here.off - slopes @ (ahead - here.y)).cost(weight, problem)
+        still = still + 1 if after > max((1 - SLACK) * before, FAR * len(here.off)) else 0
         if after < (1 + SLACK) * before + 1:
             if length >= SURE_STEP:  # after shorter ones mostly rare counts differ
                 slopes = _updated(slopes, here, there)
-            wanted = length >= SURE_STEP and after > MUCH_LESS * before and taken < MOST_SLOPES
+            falls_less = before - after < AS_FORESEEN * (before - foreseen)
+            wanted = length >= SURE_STEP and falls_less and taken < MOST_SLOPES
             here, fresh, damping = there, False, damping / 10 if damping > LEAST_DAMPING else 0.0
         else:
             damping, wanted = max(10 * damping, LEAST_DAMPING), not fresh and taken < 2 * MOST_SLOPES
