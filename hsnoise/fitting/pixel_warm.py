@@ -35,7 +35,7 @@ def _growth(found: Survey, c: int, darks_s: float, off: np.ndarray, columns: int
         if group.kind != "flat" or group.exposure_s == darks_s:
             continue
         level, highest = _levels(group, c)
-        kept = chosen & (highest < found.full_scale_dn)
+        kept = chosen & (off[1] > 0) & (highest < found.full_scale_dn)
         if kept.sum() <= FEWEST_HOT:
             continue
         ratio = beyond_neighbours(level[None], columns)[0, kept] / off[1, kept]
