@@ -29,7 +29,7 @@ def hot_of(pixel: PixelFit, many: list[tuple[Population, float]]) -> dict[str, d
 
 def of_most(name: str, pairs: list[tuple[float, float]]) -> dict[str, tuple[float, float]]:
     """A shape of the distribution by its name, if most colours have one: mean over those colours."""
-    heavy = [pair for pair in pairs if pair[0] > 0]
+    heavy = [pair for pair in pairs if pair[0] != 0]
     return {name: of_colours(heavy)} if 2 * len(heavy) > len(pairs) else {}
 
 

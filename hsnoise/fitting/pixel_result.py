@@ -221,7 +221,7 @@ def _population(
         [(p.spread[0], np.hypot(p.spread[1], p.spread[0] * _mean_error(c))) for (p, _), c in _with(pixel, many)]
     )
     if spread[0] > THERE * spread[1]:
-        found["dark_current_nonuniformity"] = {"spread": spread, **of_most("tail", [p.tail for p, _ in many])}
+        found["dark_current_nonuniformity"] = {"spread": spread, **of_most("skew", [p.skew for p, _ in many])}
     return found | hot_of(pixel, many)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import gamma
 
 from hsnoise.effects import (
     ADC,
@@ -21,6 +22,7 @@ from hsnoise.effects import (
     ReadNoise,
     ShotNoise,
 )
+from hsnoise.effects._base import Capture
 from hsnoise.model import NoiseModel, sample_dark
 
 KEY = jax.random.key(31)
@@ -40,6 +42,39 @@ def poisson_z(drawn, mean):
     squares = np.where(mean > 0, (drawn - mean) ** 2 / np.maximum(mean, 1e-300), 1)
     spread = np.sqrt(np.sum(np.where(mean > 0, 2 + 1 / np.maximum(mean, 1e-300), 0)))
     return (drawn - mean).sum() / np.sqrt(mean.sum()), (squares - 1).sum() / spread
+
+
+def factors(spread, skew, shape=(400, 500)):
+    effect = DarkCurrentNonuniformity(spread, skew)
+    capture = Capture(jnp.asarray(0.05), shape, "mono", "rolling", KEY)
+    return effect.dark_current_scale(capture, (1, *shape), key=KEY)
+
+
+@pytest.mark.parametrize(
+    ("spread", "skew", "law"),
+    [
+        (0.3, 0.0, stats.lognorm(0.3, scale=np.exp(-(0.3**2) / 2))),
+        (0.3, -0.3, stats.gamma(0.3**-2, scale=0.3**2)),
+        (0.02, -0.02, stats.gamma(0.02**-2, scale=0.02**2)),
+        (0.5, -1.0, stats.weibull_min(2, scale=1 / gamma(1.5))),
+        (1.0, -1.0, stats.expon()),
+        (0.2, 1.0, stats.invweibull(5, scale=1 / gamma(0.8))),
+    ],
+    ids=["log-normal", "gamma", "narrow gamma", "Weibull", "exponential", "Frechet"],
+)
+def test_dark_currents_have_the_laws_that_their_skews_promise(spread, skew, law):
+    drawn = np.asarray(factors(spread, skew), float)
+    assert stats.kstest(drawn.ravel(), law.cdf).pvalue > P_VALUE
+    assert abs(drawn.mean() - 1) < 5 * drawn.std() / np.sqrt(drawn.size)
+
+
+@pytest.mark.parametrize("skew", [-1.5, -0.3, 0.05, 1.0])
+def test_dark_currents_have_derivatives(skew):
+    with jax.enable_x64(True):
+        spread, by = jnp.asarray(0.2), 1e-5
+        slope = jax.jvp(lambda of: factors(of, skew, (8, 8)), (spread,), (jnp.asarray(1.0),))[1]
+        apart = (factors(spread + by, skew, (8, 8)) - factors(spread - by, skew, (8, 8))) / (2 * by)
+        np.testing.assert_allclose(slope, apart, rtol=1e-3, atol=1e-4)
 
 
 def test_hot_pixels_are_few_exponential_and_poisson():

@@ -1,10 +1,10 @@
 """How pixels differ: the distributions of dark current and offsets over pixels, without the noise of estimation.
 
-Dark current is modelled like the effects that draw it: log-normal, with a tail of a power law where it shows
-(`dark_current_nonuniformity`), and an exponential extra in a fraction of pixels (`hot_pixels`), whose mean may be
-log-normal as well. It is fitted to the measured growth of all pixels by maximum likelihood, with the known noise of a
-pixel's growth as part of the distribution. Offsets are normal; their variance is the covariance of two halves of the
-frames, which noise does not enter.
+Dark current is modelled like the effects that draw it: log-normal, or of a generalised gamma distribution where it is
+skewed more or less (`dark_current_nonuniformity`), and an exponential extra in a fraction of pixels (`hot_pixels`),
+whose mean may be log-normal as well. It is fitted to the measured growth of all pixels by maximum likelihood, with the
+known noise of a pixel's growth as part of the distribution. Offsets are normal; their variance is the covariance of two
+halves of the frames, which noise does not enter.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.laguerre import laggauss
 from scipy.optimize import minimize
 from scipy.special import erfcx, ndtr
 
@@ -24,13 +23,16 @@ from hsnoise.statistics.pixels.sample import of_neighbours
 
 Loss = Callable[[np.ndarray], float]
 
-TAIL, FRACTION, HOT_SPREAD = 2, 3, 5  # places in the vector of numbers that is fitted
-ABSENT, STARTS = -np.inf, {TAIL: np.log(0.1), HOT_SPREAD: np.log(0.5)}  # of logarithms
+SKEW, FRACTION, HOT_SPREAD = 2, 3, 5  # places in the vector of numbers that is fitted
+ABSENT, STARTS = np.nan, {SKEW: (0.5, -0.5), HOT_SPREAD: (np.log(0.5),)}
 QUICK = (400,)  # iterations
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
 HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
-TAIL_NODES, MOST_TAIL = 12, 0.45  # over the exponential part of the logarithm; its largest mean
+LOGS = np.linspace(-30.0, 30.0, 1201)  # of skewed dark currents, in units of their spread
+MOST_SKEW, MOST_TAIL = 2.0, 0.45  # of either sign; skew times spread: the variance is infinite from 0.5 on
+LEAST_WEIGHT = 1e-9  # of nodes that count
+AS_NORMAL, LEAST_SKEW = 0.01, 0.1  # below which the logarithm is normal; which counts
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
 APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by more, it is a hit or a jump
@@ -51,8 +53,7 @@ class Population:
 
     Attributes:
         mean: of ordinary pixels, independent of the limit above which pixels are called hot.
-        spread: of ln dark current of ordinary pixels (0: they do not differ), beside an exponential part of mean `tail`
-            (0: none).
+        spread, skew: of ln dark current of ordinary pixels (0: they do not differ; 0: log-normal).
         hot_fraction, hot_rate: share of hot pixels (0: none), and mean of their extra dark current, such that
             the mean over all pixels is the measured one; hot_spread: of ln mean over hot pixels (0: exponential).
         at_readout: mean extra charge of hot pixels that is independent of exposure, DN.
@@ -63,7 +64,7 @@ class Population:
 
     mean: float
     spread: tuple[float, float]
-    tail: tuple[float, float]
+    skew: tuple[float, float]
     hot_fraction: tuple[float, float]
     hot_rate: tuple[float, float]
     hot_spread: tuple[float, float]
@@ -98,7 +99,7 @@ def population_of(
     values, errors = _fitted(growth - fallen, noise)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[3:], errors[3:] = 0.0, np.inf
-    body, spread, tail, fraction, rate, hot_spread = values
+    body, spread, skew, fraction, rate, hot_spread = values
     below = float(growth[growth < limit - pedestal_dn_per_s].mean())
     beyond = 0.0
     if fraction > 0:
@@ -119,12 +120,12 @@ def population_of(
     return Population(
         mean=mean,
         spread=(spread, errors[1]),
-        tail=(tail, errors[2]),
+        skew=(skew, errors[2]),
         hot_fraction=(fraction, errors[3]),
         hot_rate=(rate, errors[4]),
         hot_spread=(hot_spread, errors[5]),
         at_readout=_at_readout(pixels, halves, noise, rate),
-        offset_sigma=offset_sigma(pattern, _width(spread, tail) * body * shortest, low_side_dn),
+        offset_sigma=offset_sigma(pattern, _width(spread, skew) * body * shortest, low_side_dn),
         median=float(np.median(growth)),
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
@@ -190,17 +191,17 @@ def growth_cdf(
     noise: float,
     mean: float,
     spread: float,
-    tail: float,
+    skew: float,
     fraction: float,
     rate: float,
     hot_spread: float = 0.0,
 ) -> np.ndarray:
-    """Share of pixels whose measured growth is below x: log-normal, plus exponential in a fraction, plus noise.
+    """Share of pixels whose measured growth is below x: ordinary ones, plus exponential in a fraction, plus noise.
 
-    tail: mean of an exponential part of ln growth; hot_spread: standard deviation of ln of the hot pixels' mean.
+    spread, skew: of ln growth; hot_spread: standard deviation of ln of the hot pixels' mean.
     """
-    width = mean * _width(spread, tail)
-    plain = _wide_noise(x, noise, mean, spread, tail) if noise > WIDE * width else _narrow(x, noise, mean, spread, tail)
+    width = mean * _width(spread, skew)
+    plain = (_wide_noise if noise > WIDE * width else _narrow_noise)(x, noise, mean, spread, skew)
     if fraction <= 0:
         return plain
     # Next to so wide an extra, the ordinary part of hot pixels can be taken as normal.
@@ -211,29 +212,45 @@ def growth_cdf(
     return (1 - fraction) * plain + fraction * (warm @ weight)
 
 
-def _wide_noise(x: np.ndarray, noise: float, mean: float, spread: float, tail: float) -> np.ndarray:
+def _wide_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew: float) -> np.ndarray:
     """Share of ordinary pixels below x, by nodes over their dark currents."""
-    z, weight = normal_nodes(NODES)
-    body = mean * np.exp(spread * z - spread**2 / 2)
-    if tail > 0:
-        more, of_more = laggauss(TAIL_NODES)
-        body = (body[:, None] * (1 - tail) * np.exp(tail * more)).ravel()
-        weight = (weight[:, None] * of_more).ravel()
-    return ndtr((x[:, None] - body) / noise) @ weight
+    if skew == 0:
+        z, weight = normal_nodes(NODES)
+        body = np.exp(spread * z - spread**2 / 2)
+    else:
+        there = (weight := _of_logs(skew)) > LEAST_WEIGHT
+        body, weight = np.exp(spread * LOGS[there]), weight[there] / weight[there].sum()
+        body /= weight @ body
+    return ndtr((x[:, None] - mean * body) / noise) @ weight
 
 
-def _narrow(x: np.ndarray, noise: float, mean: float, spread: float, tail: float) -> np.ndarray:
+def _narrow_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew: float) -> np.ndarray:
     """The same by nodes over the noise: narrow noise would leave steps between those over the dark currents."""
     z, weight = normal_nodes(NODES)
-    left = np.maximum(x[:, None] - noise * z, 1e-300) / (mean * (1 - tail))
-    off = np.log(left) / spread + spread / 2
-    below = ndtr(off) if tail <= 0 else ndtr(off) - _exponential_share(off, spread / tail)
-    return below @ weight
+    logs = np.log(np.maximum(x[:, None] - noise * z, 1e-300) / mean) / spread
+    if skew == 0:
+        return ndtr(logs + spread / 2) @ weight
+    of_logs = _of_logs(skew)
+    below = np.cumsum(of_logs) - of_logs / 2
+    return np.interp(logs + np.log(of_logs @ np.exp(spread * LOGS)) / spread, LOGS, below) @ weight
 
 
-def _width(spread: float, tail: float) -> float:
+def _of_logs(skew: float) -> np.ndarray:
+    """Probability of each of LOGS: those of the logarithm of a gamma number of shape 1 / skew^2, standardised.
+
+    Reference: Prentice, "A log gamma model and its maximum likelihood estimation", Biometrika 61, 1974 (q = -skew).
+    """
+    shape, logs = skew**-2, -skew * LOGS
+    density = np.exp(shape * (logs - np.expm1(np.minimum(logs, 50.0))))
+    return density / density.sum()
+
+
+def _width(spread: float, skew: float) -> float:
     """Standard deviation of the dark current of ordinary pixels, relative to its mean."""
-    return float(np.sqrt(np.exp(spread**2) * (1 - tail) ** 2 / (1 - 2 * tail) - 1))
+    if skew == 0:
+        return float(np.sqrt(np.expm1(spread**2)))
+    of_logs, body = _of_logs(skew), np.exp(spread * LOGS)
+    return float(np.sqrt(max(of_logs @ body**2 / (of_logs @ body) ** 2 - 1, 0.0)))
 
 
 def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
@@ -245,7 +262,7 @@ def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray
 
 
 def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """(mean, spread, tail, fraction, rate, hot spread) of the growth [pixel], and errors; zeros for what is not
+    """(mean, spread, skew, fraction, rate, hot spread) of the growth [pixel], and errors; zeros for what is not
     significant."""
     middle = float(np.median(growth))
     core = 1.4826 * float(np.median(np.abs(growth - middle)))
@@ -268,32 +285,38 @@ def _fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
     share = float(np.clip(len(excess) / len(growth), 1e-5, 0.1))
     start = [middle / core, np.log(0.2), ABSENT, np.log(share / (MOST_HOT - share)), np.log(rate / core), ABSENT]
-    shapes = [TAIL] * (middle > 0) + [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
+    shapes = [SKEW] * (middle > 0) + [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
     theta = _likeliest(loss, np.array(start), shapes)
-    cool = _least(loss, np.append(theta[:FRACTION], [COOL, theta[4], ABSENT]), (FRACTION, 4), QUICK)
+    cool = np.append(theta[:SKEW], [ABSENT, COOL, theta[4], ABSENT])
+    cool = _likeliest(loss, cool, shapes[: middle > 0], (FRACTION, 4))
     found = natural(theta)
     there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
     # Many pixels that are hardly warmer than the others are their tail, not hot pixels.
     if not there or found[4] < HOT_FROM * found[0] or found[3] > 0.95 * MOST_HOT:
         theta = cool
     values = np.array(natural(theta))
-    units = np.array([core, values[1], values[2], values[3] * (1 - values[3] / MOST_HOT), values[4], values[5]])
+    units = np.array([core, values[1], 1.0, values[3] * (1 - values[3] / MOST_HOT), values[4], values[5]])
     errors = _errors(loss, theta) * np.where(units > 0, units, 1.0)
     if theta[HOT_SPREAD] >= MOST_HOT_SPREAD:
         errors[HOT_SPREAD] = 0.0  # held there
     if theta is cool:
         values[3:], errors[3:] = 0.0, np.inf
     alike = _least(loss, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,), QUICK)
-    if (values[1] < LEAST_SPREAD and values[2] <= 0) or 2 * (loss(alike) - loss(theta)) < SIGNIFICANT:
+    if (values[1] < LEAST_SPREAD and values[2] == 0) or 2 * (loss(alike) - loss(theta)) < SIGNIFICANT:
         values[1:3], errors[1:3] = 0.0, np.maximum(values[1:3], errors[1:3])
     return values, errors
 
 
-def _likeliest(loss: Loss, plain: np.ndarray, shapes: list[int]) -> np.ndarray:
-    """The numbers that are likeliest, with those of `shapes` that make them significantly likelier."""
-    found = [_least(loss, plain)]
+def _likeliest(loss: Loss, plain: np.ndarray, shapes: list[int], held: tuple[int, ...] = ()) -> np.ndarray:
+    """The numbers that are likeliest, with those of `shapes` that make them significantly likelier.
+
+    A small skew is left out: the noise of growth, which is larger where growth is, makes one of 0.04.
+    """
+    found = [_least(loss, plain, held)]
     for of in shapes:
-        found += [_least(loss, np.where(np.arange(len(plain)) == of, STARTS[of], theta)) for theta in found]
+        starts = [np.where(np.arange(len(plain)) == of, start, theta) for theta in found for start in STARTS[of]]
+        found += [_least(loss, theta, held) for theta in starts]
+    found = [theta for theta in found if not abs(theta[SKEW]) < LEAST_SKEW]
     return min(found, key=lambda theta: 2 * loss(theta) + SIGNIFICANT * len(_free(theta)))
 
 
@@ -319,19 +342,18 @@ def _least(
 
 def _free(theta: np.ndarray) -> list[int]:
     """Which numbers are there."""
-    return list(np.flatnonzero(theta != ABSENT))
+    return list(np.flatnonzero(~np.isnan(theta)))
 
 
 def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
-    """Mean, spread, tail, fraction, rate and hot spread from unconstrained numbers in units of the core's width."""
+    """Mean, spread, skew, fraction, rate and hot spread from unconstrained numbers in units of the core's width."""
     fraction = MOST_HOT / (1 + np.exp(-np.clip(theta[FRACTION], -40, 40)))
     rate = core * float(np.exp(np.clip(theta[4], -12, 12)))
-    tail, hot_spread = (
-        min(float(np.exp(theta[TAIL])), MOST_TAIL),
-        float(np.exp(min(theta[HOT_SPREAD], MOST_HOT_SPREAD))),
-    )
     spread = float(np.exp(np.clip(theta[1], -12, 1.2)))
-    return core * max(float(theta[0]), 1e-3), spread, tail, float(fraction), rate, hot_spread
+    skew = 0.0 if np.isnan(theta[SKEW]) else float(np.clip(theta[SKEW], -MOST_SKEW, min(MOST_SKEW, MOST_TAIL / spread)))
+    hot_spread = 0.0 if np.isnan(theta[HOT_SPREAD]) else float(np.exp(min(theta[HOT_SPREAD], MOST_HOT_SPREAD)))
+    skew = 0.0 if abs(skew) < AS_NORMAL else skew
+    return core * max(float(theta[0]), 1e-3), spread, skew, float(fraction), rate, hot_spread
 
 
 def _errors(loss: Loss, theta: np.ndarray) -> np.ndarray:
