@@ -55,7 +55,7 @@ class DarkCurrentNonuniformity(AbstractEffect):
     def __check_init__(self):
         if any(is_traced(of) or not isinstance(of, jax.Array) for of in (self.spread, self.skew)):
             return  # what is no number has an error of its own
-        if (product := float(jnp.max(self.spread * self.skew))) >= 1:
+        if 1 <= (product := float(jnp.max(self.spread * self.skew))) < jnp.inf:
             raise ValueError(f"{self.name}.skew: expected spread * skew below 1, for a finite mean, got {product:.3g}.")
 
     def dark_current_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap:

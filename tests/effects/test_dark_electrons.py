@@ -68,6 +68,11 @@ def test_dark_currents_have_the_laws_that_their_skews_promise(spread, skew, law)
     assert abs(drawn.mean() - 1) < 5 * drawn.std() / np.sqrt(drawn.size)
 
 
+def test_dark_currents_without_a_mean_are_refused():
+    with pytest.raises(ValueError, match=r"dark_current_nonuniformity\.skew: expected spread \* skew below 1"):
+        DarkCurrentNonuniformity(0.8, 1.5)
+
+
 @pytest.mark.parametrize("skew", [-1.5, -0.3, 0.05, 1.0])
 def test_dark_currents_have_derivatives(skew):
     with jax.enable_x64(True):
