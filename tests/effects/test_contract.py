@@ -103,7 +103,7 @@ EXAMPLES = [
     AmplifierGlow(200.0, 0.3),
     DarkCurrentDrift(60.0),
     DarkCurrentInstability(0.3),
-    DarkCurrentNonuniformity(0.4, 0.5),
+    DarkCurrentNonuniformity(0.3, 0.5),
     RandomTelegraphNoise(0.5, 8.0, 0.4),
     HeavyTailedReadNoise(6.0),
     ReadNoiseNonuniformity(0.4),
