@@ -112,6 +112,44 @@ def test_flats_of_unequal_light_are_not_taken_for_smoothed(good):
     assert not any("smoothed" in doubt for doubt in fit.doubts), fit.doubts
 
 
+def drawn_with(effects, jump_dn=0):
+    """Counts of two exposures [frame, row, column] by a model with these effects; one frame of the first jumps."""
+    base = [hsnoise.effects.ShotNoise(), hsnoise.effects.DarkCurrent(400.0), hsnoise.effects.ReadNoise(READ_E)]
+    end = [hsnoise.effects.Gain(GAIN), hsnoise.effects.BlackLevel(BLACK), hsnoise.effects.ADC(65535)]
+    model = hsnoise.NoiseModel([*base, *effects, *end], cfa="mono", shutter="global", exposure_s=0.1)
+    drawn = [
+        np.array(
+            hsnoise.sample_dark(jax.random.key(i), FRAMES, SHAPE, model, exposure_s=t, sensor_key=jax.random.key(7))
+        )
+        for i, t in enumerate((0.1, 0.4))
+    ]
+    drawn[0][2] += jump_dn
+    return [one.astype(np.uint16) for one in drawn]
+
+
+@pytest.mark.parametrize(
+    ("effect", "jump_dn", "says"),
+    [
+        (hsnoise.effects.FrameOffset(1.0), 4, "black level jumps"),
+        (hsnoise.effects.Crosstalk(0.02), 0, "the signal is coupled"),
+        (hsnoise.effects.RandomTelegraphNoise(0.05, 40.0), 0, "Pixels differ"),
+    ],
+    ids=["offsets", "crosstalk", "telegraph noise"],
+)
+def test_what_an_effect_of_the_model_draws_is_no_doubt(effect, jump_dn, says):
+    fit = hsnoise.fit(drawn_with([] if jump_dn else [effect], jump_dn), exposure_s=(0.1, 0.4), pixels="alike")
+    assert any(says in doubt for doubt in fit.doubts), fit.doubts
+    found = surveyed(fit.stack)
+    again = checked(replace(fit, params=fit.params.add(effect)), Evidence(found, fit.summary))
+    assert not any(says in doubt for doubt in again.doubts), again.doubts
+
+
+def test_a_frame_beyond_the_offsets_of_the_model_is_told():
+    fit = hsnoise.fit(drawn_with([], 4), exposure_s=(0.1, 0.4), pixels="alike")
+    small = replace(fit, params=fit.params.add(hsnoise.effects.FrameOffset(0.1)))
+    assert any("jumps" in doubt for doubt in checked(small, Evidence(surveyed(fit.stack), fit.summary)).doubts)
+
+
 @pytest.mark.slow
 def test_a_gain_that_nothing_tells_is_withheld_by_the_likelihood_too(rng):
     """Bias frames alone: 1.0 ± 18.9 DN/e- had been printed with a green light."""

@@ -10,19 +10,21 @@ from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, Memory, together
 from hsnoise.statistics.pixels.oddities import smoothed
 from hsnoise.statistics.pixels.survey import Survey
 
+COUPLING = {"crosstalk", "brighter_fatter", "readout_bandwidth", "readout_overshoot"}  # effects that act on the signal
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
 
 
 def shared_noise(result: FitResult, found: Survey) -> tuple[list[str], list[str]]:
-    """Sentences on what makes numbers wrong, and on what makes them a little wrong."""
-    pixel, shared = result.transfer, of_the_signal(found.along)
+    """Sentences on what makes numbers wrong, and on what makes them a little wrong; nothing that effects describe."""
+    pixel, shared, names = result.transfer, of_the_signal(found.along), set(result.params.names)
     much: list[str] = []
     little: list[str] = []
-    if pixel is None or pixel.ringing is None:
+    if (pixel is None or pixel.ringing is None) and names.isdisjoint({*COUPLING, "correlated_read_noise"}):
         much += smoothed(found)
-    if pixel is None or not any(one.bend.spreads for one in pixel.channels):
+    spreads = pixel is not None and any(one.bend.spreads for one in pixel.channels)
+    if not spreads and names.isdisjoint(COUPLING):
         (much if abs(2 * sum(shared)) > MOST_COUPLED else little).extend(_coupled(shared))
-    memory = None if "image_lag" in result.params else _memory(found)
+    memory = None if "image_lag" in names else _memory(found)
     if memory is not None:
         (much if 2 * memory.share > MOST_COUPLED else little).append(memory.sentence)
     return much, little

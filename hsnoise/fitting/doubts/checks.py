@@ -3,8 +3,9 @@
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
 headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
 `_taps`: outputs with gains of their own. `_shared`: noise that is not a pixel's own. `_few`: what two or three frames
-leave open. `_waiting`: dark signal without exposure. `_choice`: which of two fits to believe. Here: a gain without
-growth of signal to support it, frames and pixels that measure nothing, and the order of all checks.
+leave open. `_pooled`: what pooled histograms hide. `_waiting`: dark signal without exposure. `_choice`: which of two
+fits to believe. Here: a gain without growth of signal to support it, frames and pixels that measure nothing, and the
+order of all checks.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from hsnoise.fitting.doubts._drawn import disagreements
 from hsnoise.fitting.doubts._evidence import Evidence
 from hsnoise.fitting.doubts._few import few_frames, single_frames
 from hsnoise.fitting.doubts._lines import curves, defects
+from hsnoise.fitting.doubts._pooled import of_pooling, offsets_dn
 from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._shared import shared_noise
 from hsnoise.fitting.doubts._stated import header_gain, stated
@@ -32,7 +34,7 @@ from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.parameters import numbers_of, read_noise_dn
 from hsnoise.statistics.pixels.companding import companded
 from hsnoise.statistics.pixels.oddities import lit_darks, moved_frames, oddities_of, pixels_apart
-from hsnoise.statistics.pixels.structure import fall_of, noise_spread, static_of
+from hsnoise.statistics.pixels.structure import fall_of, noise_spread
 from hsnoise.statistics.pixels.survey import Survey
 from hsnoise.statistics.pixels.transfer import ROUNDING, Transfer
 
@@ -47,19 +49,18 @@ MOST_CLIPPED = 0.02  # share of counts: where it is cut so near, the noise comes
 LONG_S = 0.5  # of the only dark exposure, from which its dark signal may show
 LEAST_STEPS = 0.8  # of a step of the codes: with less noise rounding is no noise of its own
 MANY_HOT = 0.15  # share of pixels
-STATIC_SHARE = 0.03  # static variance that a pooled fit mistakes for noise, over the temporal variance
 
 
 def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
-    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _falling, _of_pooling)
+    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _falling, of_pooling)
     checks = (single_frames, *coarse, *of_pixels, disagreements)
     open_gain = [*_withheld(result, found)]
     grave = [sentence for check in checks for sentence in check(result, found)]
     odd = oddities_of(found)
     grave += [*stated(result, seen), *odd]
-    moved, (much, little) = tuple(moved_frames(found)), shared_noise(result, found)
+    moved, (much, little) = tuple(moved_frames(found, offsets_dn(result))), shared_noise(result, found)
     grave += moved if result.transfer is None else ()
     grave += much
     share = _outlier_share(result)
@@ -371,22 +372,3 @@ def _of_narrow(result: FitResult, found: Survey) -> Iterator[str]:
         f"The noise of the darks is narrower than a count, and rounding hides most of it: read noise is below"
         f" {bound:.2g} DN{electrons}. A higher gain setting, or more bits, would show it."
     )
-
-
-def _of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
-    """Static structure that a fit by pooled histograms mistakes for noise."""
-    if result.method == Method.TRANSFER:
-        return
-    worst = 0.0
-    for c in range(len(found.channels)):
-        for group in found.darks:
-            one = static_of(found, group, c)
-            if one is not None and one.variance_dn2 > APART_SIGMAS * one.error_dn2:
-                worst = max(worst, one.variance_dn2 / max(one.temporal_dn2, 1e-12))
-    known = {"dark_signal_nonuniformity", "dark_current_nonuniformity", "hot_pixels"} & set(result.params.names)
-    if worst > STATIC_SHARE and not known:
-        yield (
-            f"Pixels differ: their static variance is up to {worst:.0%} of the temporal one, and this fit mistakes it"
-            " for noise. Gain, dark current and read noise may be off by as much; hsnoise improve finds what is"
-            " missing."
-        )

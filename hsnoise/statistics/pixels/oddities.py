@@ -97,10 +97,13 @@ def _lit_frames(found: Survey) -> Iterator[str]:
             )
 
 
-def moved_frames(found: Survey) -> Iterator[str]:
-    """Frames whose black level is another, by less than the noise of a pixel: nothing where frames are followed."""
+def moved_frames(found: Survey, offsets_dn: float = 0.0) -> Iterator[str]:
+    """Frames whose black level is another, by less than the noise of a pixel: nothing where frames are followed.
+
+    offsets_dn: by how much levels of frames may differ.
+    """
     for group, f, off in _odd_levels(found):
-        if abs(off) <= LIT * group.noise_dn:
+        if offsets_dn < abs(off) <= LIT * group.noise_dn:
             why = "settles after a pause" if f == 0 else "jumps"
             yield f"{_called(group, f)} is {abs(off):.3g} DN {_side(off)} than the others: the black level {why}."
 
