@@ -7,7 +7,7 @@ import pytest
 from scipy.special import gammaln
 
 import hsnoise
-from hsnoise.statistics.pixels.population import _fitted, growth_cdf
+from hsnoise.statistics.pixels.dark_currents import fitted, growth_cdf
 
 PLAIN, HEAVY = (30.0, 0.4, 0.0, 0.005, 180.0, 0.0), (20.0, 0.2, 0.0, 0.02, 300.0, 1.2)
 WARM, BOTH = (20.0, 0.15, 1.0, 0.005, 300.0, 0.0), (20.0, 0.15, 1.0, 0.02, 300.0, 0.8)
@@ -40,7 +40,7 @@ def test_distribution_of_growth_is_that_of_draws(truth, noise):
 @pytest.mark.parametrize("noise", NOISES[:2])
 @pytest.mark.parametrize("truth", [PLAIN, HEAVY, WARM, BOTH, GAMMA, WEIBULL], ids=str)
 def test_population_is_recovered_whatever_the_noise(noise, truth):
-    values, errors = _fitted(drawn(np.random.default_rng(2), 120_000, noise, *truth), noise)
+    values, errors = fitted(drawn(np.random.default_rng(2), 120_000, noise, *truth), noise)
     there = (np.array(truth) != 0) & ((np.arange(6) < 3) | (truth[3] > 0))
     pulls = (values - truth)[there] / errors[there]
     assert np.all(np.abs(pulls) < 4), (values, errors)

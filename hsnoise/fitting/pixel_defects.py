@@ -51,7 +51,8 @@ def warm_of(pixel: PixelFit, gain: np.ndarray, exposure_s: float) -> dict[str, d
     at_readout = 1 - growth * exposure_s
     if growth > GROWS * error and (at_readout > GROWS * error * exposure_s or exposure_s == 0):
         rate = charge[0] * growth, float(np.hypot(charge[1] * growth, charge[0] * error))
-        return {"hot_pixels": {**hot, "rate": rate, "at_readout": (charge[0] * at_readout, charge[1] * at_readout)}}
+        of_readout = float(np.hypot(charge[1] * at_readout, charge[0] * error * exposure_s))
+        return {"hot_pixels": {**hot, "rate": rate, "at_readout": (charge[0] * at_readout, of_readout)}}
     if exposure_s > 0:
         return {"hot_pixels": {**hot, "rate": (charge[0] / exposure_s, charge[1] / exposure_s)}}
     return {"hot_pixels": {**hot, "rate": (0.0, np.inf), "at_readout": charge}}

@@ -20,7 +20,7 @@ from hsnoise.fitting.pixel_joint import UNKNOWN, joint_estimate
 from hsnoise.fitting.pixel_levels import black_of_pixels, growth_of_means, is_unlit, mean_black, subtracted
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_narrow import law_of, narrow_of, variance_of, with_law
-from hsnoise.fitting.pixel_offsets import offset_of, pattern_of
+from hsnoise.fitting.pixel_offsets import offset_of, offset_patterns
 from hsnoise.fitting.pixel_outputs import outputs_by_light
 from hsnoise.fitting.pixel_patterns import (
     banding_in,
@@ -366,7 +366,7 @@ def _population(found: Survey, c: int, pixels: Levels, transfer: Transfer, of_gl
         ordinary -= float(of_glow[slope_over(t, pixels.level).mean(0) < limit].mean())
         pixels = without_glow(pixels, of_glow)
         limit = hot_from(slope_over(t, pixels.level))
-    return population_of(pixels, limit, ordinary, shift, *pattern_of(found, c))
+    return population_of(pixels, limit, ordinary, shift, offset_patterns(found, c))
 
 
 def _with_flats(one: Channel, moments: FlatMoments, flats: FlatGain, c: int) -> Channel:

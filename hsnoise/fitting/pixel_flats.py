@@ -75,7 +75,7 @@ def _levels(found: Survey, c: int, black_dn: float, offset_dn: float, flats: Fla
             *_evened(flats, c, bend, signal),
         )
         for g, signal in zip(found.repeated_flats, signals, strict=True)
-        if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * brightest and not _saturates(g.pixels(c, "highest"))
+        if LEAST_SIGNAL_DN <= signal <= SAME_LIGHT * brightest and not saturates(g.pixels(c, "highest"))
     ]
 
 
@@ -148,7 +148,7 @@ def _responses_differ(found: Survey) -> bool:
     rows = len(found.sampled_rows) * plane_rows(found)
     for group in found.repeated_flats:
         for c in range(len(found.channels)):
-            if _saturates(group.pixels(c, "highest")):
+            if saturates(group.pixels(c, "highest")):
                 continue
             blocks = [within_blocks(plane.halves.level_dn, rows, SIDES[0])[0] for plane in group.of(c)]
             variance, error = shared_variance(np.concatenate(blocks, axis=1).reshape(2, -1))
@@ -172,7 +172,7 @@ class Level(NamedTuple):
     alike: float
 
 
-def _saturates(highest: np.ndarray) -> bool:
+def saturates(highest: np.ndarray) -> bool:
     return bool((highest == highest.max()).mean() > MOST_SATURATED)
 
 

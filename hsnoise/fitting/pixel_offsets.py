@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hsnoise.fitting.pixel_patterns import shortest_of
-from hsnoise.statistics.pixels.population import Population, offset_sigma, root_of, winsorised
+from hsnoise.statistics.pixels.classes import slope_over
+from hsnoise.statistics.pixels.population import Patterns, Population, offset_sigma, root_of, winsorised
 from hsnoise.statistics.pixels.structure import beside_neighbours, low_side_sigma, plane_rows
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
@@ -25,8 +26,8 @@ def offset_of(found: Survey, c: int, population: Population | None) -> tuple[flo
     elif found.shortest is None:
         return 0.0, np.inf
     else:
-        pattern, low_side = pattern_of(found, c)
-        sigma, error = offset_sigma(pattern, 0.0, low_side)
+        patterns = offset_patterns(found, c)
+        sigma, error = offset_sigma(patterns.shortest, 0.0, patterns.low_side_dn)
     across = _across(found, c) if sigma > 0 else None
     if across is not None and sigma**2 - across[0] > NOT_SHARED * np.hypot(across[1], 2 * sigma * error):
         return root_of(*across)
@@ -42,15 +43,18 @@ def _by_waves(found: Survey, c: int) -> float:
     return sum(wave.variance_dn2 for wave in found.waves) / np.sqrt(2 * first * second)
 
 
-def pattern_of(found: Survey, c: int) -> tuple[np.ndarray, float]:
-    """Pixels beside their neighbours at the shortest exposure [half, pixel], and their low-side deviation, DN.
-
-    Without stuck pixels.
-    """
-    planes, rows = shortest_of(found, c), _rows(found)
+def offset_patterns(found: Survey, c: int) -> Patterns:
+    """Pixels beside their neighbours, without stuck pixels."""
+    planes, rows, kept = shortest_of(found, c), _rows(found), ~found.stuck(c)
     halves = [plane.halves for plane in planes]
     low_side = float(np.mean([low_side_sigma(of.level_dn, rows, of.n_frames[1]) for of in halves]))
-    return _beside(planes, rows)[:, ~found.stuck(c)], low_side
+    shortest, unexposed = _beside(planes, rows)[:, kept], None
+    if found.has_exposures and found.shortest.exposure_s > 0:
+        darks = found.repeated_darks
+        t = np.array([group.exposure_s for group in darks])
+        several = np.array([_beside(group.of(c), rows)[:, kept] for group in darks])
+        unexposed = several.mean(0) - slope_over(t, several) * t.mean()
+    return Patterns(shortest, unexposed, low_side)
 
 
 def _rows(found: Survey) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hsnoise.fitting.pixel_flats import between, weighted_mean
+from hsnoise.fitting.pixel_flats import between, saturates, weighted_mean
 from hsnoise.statistics.pixels.population import FEWEST_HOT, WARM_SIGMAS, Warm, beyond_neighbours, warm_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -36,7 +36,7 @@ def _growth(found: Survey, c: int, darks_s: float, off: np.ndarray, columns: int
             continue
         level, highest = _levels(group, c)
         kept = chosen & (off[1] > 0) & (highest < found.full_scale_dn)
-        if kept.sum() <= FEWEST_HOT:
+        if kept.sum() <= FEWEST_HOT or saturates(highest):
             continue
         ratio = beyond_neighbours(level[None], columns)[0, kept] / off[1, kept]
         error = OF_MEDIAN * 1.4826 * np.median(np.abs(ratio - np.median(ratio))) / np.sqrt(kept.sum())
