@@ -31,3 +31,12 @@ def test_interference_of_pairs_of_frames_is_no_offset(rng, offset_dn):
     else:  # no gain: as DN
         value, error, _ = fit.shown["dark_signal_nonuniformity.sigma"]
         assert abs(value - offset_dn) < 4 * error < offset_dn
+
+
+def test_offsets_are_not_lost_where_the_shortest_darks_have_as_much_dark_signal():
+    rng, shape, offset_e, exposures_s = np.random.default_rng(3), (128, 192), 3.0, (1.0, 10.0)
+    rate, offset = 20 * np.exp(0.5 * rng.standard_normal(shape) - 0.125), offset_e * rng.standard_normal(shape)
+    darks = [rng.poisson(rate * t, (6, *shape)) + offset + 4 * rng.standard_normal((6, *shape)) for t in exposures_s]
+    fit = hsnoise.fit([np.rint(200 + one).astype(np.uint16) for one in darks], exposure_s=exposures_s)
+    sigma, error, _ = fit.table["dark_signal_nonuniformity.sigma"]
+    assert abs(sigma - offset_e) < 4 * error and error < 0.1

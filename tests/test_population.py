@@ -12,6 +12,7 @@ from hsnoise.statistics.pixels.dark_currents import fitted, growth_cdf
 PLAIN, HEAVY = (30.0, 0.4, 0.0, 0.005, 180.0, 0.0), (20.0, 0.2, 0.0, 0.02, 300.0, 1.2)
 WARM, BOTH = (20.0, 0.15, 1.0, 0.005, 300.0, 0.0), (20.0, 0.15, 1.0, 0.02, 300.0, 0.8)
 GAMMA, WEIBULL = (20.0, 0.3, -0.3, 0.0, 1.0, 0.0), (20.0, 0.5, -1.0, 0.005, 300.0, 0.0)
+BESIDE = (10.0, 0.8, -0.8, 0.01, 50.0, 0.0)
 TRUTHS = [PLAIN, (20.0, 0.2, 0.0, 0.02, 100.0, 0.0), (5.0, 0.6, 0.0, 0.0, 1.0, 0.0), HEAVY, WARM, BOTH, GAMMA, WEIBULL]
 NOISES = [0.8, 4.0, 15.0]  # far narrower than the population, about as wide, wider
 
@@ -38,7 +39,7 @@ def test_distribution_of_growth_is_that_of_draws(truth, noise):
 
 
 @pytest.mark.parametrize("noise", NOISES[:2])
-@pytest.mark.parametrize("truth", [PLAIN, HEAVY, WARM, BOTH, GAMMA, WEIBULL], ids=str)
+@pytest.mark.parametrize("truth", [PLAIN, HEAVY, WARM, BOTH, GAMMA, WEIBULL, BESIDE], ids=str)
 def test_population_is_recovered_whatever_the_noise(noise, truth):
     values, errors = fitted(drawn(np.random.default_rng(2), 120_000, noise, *truth), noise)
     there = (np.array(truth) != 0) & ((np.arange(6) < 3) | (truth[3] > 0))
