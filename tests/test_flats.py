@@ -9,7 +9,7 @@ import hsnoise
 from hsnoise import FrameStack
 from hsnoise._core.types import StatedGain
 from hsnoise.fitting.flat_notes import gain_notes, stated_gain_note
-from hsnoise.fitting.pixel_flats import _between
+from hsnoise.fitting.pixel_flats import between
 from hsnoise.likelihood.flat_gain import flat_gain
 from hsnoise.likelihood.flats import flat_moments
 
@@ -178,8 +178,8 @@ def test_one_level_of_flats_beside_bias_frames_is_a_doubt(rng, lights):
 
 def test_levels_that_disagree_show_it_in_the_error():
     same, apart = [(0.010, 1e-4), (0.0102, 1e-4)], [(0.010, 1e-5), (0.012, 1e-5), (0.011, 1e-3)]
-    assert _between(*np.array(same).T) == 0
-    assert _between(*np.array(apart).T) == pytest.approx(0.001, rel=0.01)
+    assert between(*np.array(same).T) == 0
+    assert between(*np.array(apart).T) == pytest.approx(0.001, rel=0.01)
 
 
 def test_a_stated_gain_that_is_wrong_is_named():

@@ -20,11 +20,12 @@ Loss = Callable[[np.ndarray], float]
 
 SKEW, FRACTION, HOT_SPREAD = 2, 3, 5  # places in the vector of numbers that is fitted
 ABSENT, STARTS = np.nan, {SKEW: (0.5, -0.5), HOT_SPREAD: (np.log(0.5),)}
-QUICK = (400,)  # iterations
+ROUGH, PRECISE = 1e-3, 1e-4  # of the numbers that a search finds
+MOST_ITERATIONS = 800
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
 HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
-LOGS = np.linspace(-30.0, 30.0, 1201)  # of skewed dark currents, in units of their spread
+LOGS = np.linspace(-30.0, 30.0, 601)  # of skewed dark currents, in units of their spread
 MOST_SKEW, MOST_TAIL = 2.0, 0.45  # of either sign; skew times spread: the variance is infinite from 0.5 on
 LEAST_WEIGHT = 1e-9  # of nodes that count
 AS_NORMAL, LEAST_SKEW = 0.01, 0.1  # below which the logarithm is normal; which counts
@@ -138,9 +139,10 @@ def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     start, of_body = np.array(plain), [SKEW] * (middle > 0)
     of_hot = [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
     cool = np.append(start[:FRACTION], [COOL, start[4], ABSENT])
-    cool = _likeliest(loss, [cool], of_body, (FRACTION, 4))
+    cool = _precisely(loss, _likeliest(loss, [cool], of_body, (FRACTION, 4)), (FRACTION, 4))
     # Hot pixels beside the body as it is without them, too: a skew may stand for them, or they for it.
     theta = _likeliest(loss, [start, np.append(cool[:FRACTION], start[FRACTION:])], of_body + of_hot)
+    theta = _precisely(loss, theta)
     found = natural(theta)
     there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
     # Many pixels that are hardly warmer than the others are their tail, not hot pixels.
@@ -156,7 +158,7 @@ def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
         errors[HOT_SPREAD] = 0.0  # held there
     if theta is cool:
         values[3:], errors[3:] = 0.0, np.inf
-    alike = _least(loss, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,), QUICK)
+    alike = _least(loss, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,))
     if (values[1] < LEAST_SPREAD and values[2] == 0) or 2 * (loss(alike) - loss(theta)) < SIGNIFICANT:
         values[1:3], errors[1:3] = 0.0, np.maximum(values[1:3], errors[1:3])
     return values, errors
@@ -167,21 +169,21 @@ def _likeliest(loss: Loss, starts: list[np.ndarray], shapes: list[int], held: tu
 
     A small skew is left out: the noise of growth, which is larger where growth is, makes one of 0.04.
     """
+
+    def misfit(theta: np.ndarray) -> float:
+        return np.inf if abs(theta[SKEW]) < LEAST_SKEW else 2 * loss(theta) + SIGNIFICANT * len(_free(theta))
+
     found = [_least(loss, start, held) for start in starts]
     for of in shapes:
-        without = [(theta, value) for theta in found if np.isnan(theta[of]) for value in STARTS[of]]
-        found += [_least(loss, np.where(np.arange(len(theta)) == of, value, theta), held) for theta, value in without]
-    found = [theta for theta in found if not abs(theta[SKEW]) < LEAST_SKEW]
-    return min(found, key=lambda theta: 2 * loss(theta) + SIGNIFICANT * len(_free(theta)))
+        best = min(found, key=misfit)
+        without = [theta for theta in found if np.isnan(theta[of]) and (theta is best or theta is found[0])]
+        several = [(theta, value) for theta in without for value in STARTS[of]]
+        found += [_least(loss, np.where(np.arange(len(theta)) == of, value, theta), held) for theta, value in several]
+    return min(found, key=misfit)
 
 
-def _least(
-    loss: Loss, theta: np.ndarray, held: tuple[int, ...] = (), iterations: tuple[int, ...] = (800, 800)
-) -> np.ndarray:
-    """The numbers with the lowest loss, starting from `theta`.
-
-    iterations: of each restart, because the simplex may have shrunk too early.
-    """
+def _least(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = (), within: float = ROUGH) -> np.ndarray:
+    """The numbers with the lowest loss, starting from `theta`, within a precision."""
     free = [i for i in _free(theta) if i not in held]
 
     def whole(some: np.ndarray) -> np.ndarray:
@@ -189,10 +191,13 @@ def _least(
         out[free] = some
         return out
 
-    for most in iterations:
-        options = {"maxiter": most, "xatol": 1e-4, "fatol": 0.02}
-        theta = whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
-    return theta
+    options = {"maxiter": MOST_ITERATIONS, "xatol": within, "fatol": 0.02}
+    return whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
+
+
+def _precisely(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
+    """The same begun again at its end, because the simplex may have shrunk too early."""
+    return _least(loss, theta, held, PRECISE)
 
 
 def _free(theta: np.ndarray) -> list[int]:
