@@ -32,7 +32,7 @@ def offsets_dn(result: FitResult) -> float:
 
 def of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
     """Static structure that a fit by pooled histograms mistakes for noise."""
-    if result.method == Method.TRANSFER:
+    if result.method == Method.TRANSFER or not STATIC.isdisjoint(result.params.names):
         return
     worst = 0.0
     for c in range(len(found.channels)):
@@ -40,7 +40,7 @@ def of_pooling(result: FitResult, found: Survey) -> Iterator[str]:
             one = static_of(found, group, c)
             if one is not None and one.variance_dn2 > APART_SIGMAS * one.error_dn2:
                 worst = max(worst, one.variance_dn2 / max(one.temporal_dn2, 1e-12))
-    if worst > STATIC_SHARE and STATIC.isdisjoint(result.params.names):
+    if worst > STATIC_SHARE:
         yield (
             f"Pixels differ: their static variance is up to {worst:.0%} of the temporal one, and this fit mistakes it"
             " for noise. Gain, dark current and read noise may be off by as much; hsnoise improve finds what is"

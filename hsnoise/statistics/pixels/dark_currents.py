@@ -9,6 +9,7 @@ known noise of a pixel's growth as part of the distribution.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import minimize
@@ -86,6 +87,7 @@ def _narrow_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew:
     return np.interp(logs + np.log(of_logs @ np.exp(spread * LOGS)) / spread, LOGS, below) @ weight
 
 
+@lru_cache(maxsize=1)  # the width and the distribution of one skew follow each other
 def _of_logs(skew: float) -> np.ndarray:
     """Probability of each of LOGS: those of the logarithm of a gamma number of shape 1 / skew^2, standardised.
 
