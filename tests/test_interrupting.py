@@ -22,6 +22,14 @@ AS_COMMAND = "import sys; sys.argv = ['hsnoise']\n"
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has other signals")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def heed_ctrl_c():
+    """Tests that a shell started in the background ignore it, and so would the processes that they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="module")
 def darks(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("darks") / "darks.npz"

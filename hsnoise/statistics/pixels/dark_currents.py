@@ -12,17 +12,17 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import erfcx, ndtr
+from scipy.optimize import least_squares
+from scipy.special import erfcx, kl_div, ndtr
 
 from hsnoise._core.quadrature import normal_nodes
 
-Loss = Callable[[np.ndarray], float]
+Residuals = Callable[[np.ndarray], np.ndarray]
 
 SKEW, FRACTION, HOT_SPREAD = 2, 3, 5  # places in the vector of numbers that is fitted
 ABSENT, STARTS = np.nan, {SKEW: (0.5, -0.5), HOT_SPREAD: (np.log(0.5),)}
-ROUGH, PRECISE = 1e-3, 1e-4  # of the numbers that a search finds
-MOST_ITERATIONS = 800
+SEARCH = {"x_scale": "jac", "diff_step": 1e-4, "ftol": 1e-7, "xtol": 1e-6, "gtol": None, "max_nfev": 60}
+LOOSE = 1e-3  # weight with which numbers stay where they start: some tell nothing, as a skew beyond its bounds
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
 HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
@@ -130,9 +130,11 @@ def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
             theta = np.array([0.0, np.log(1e-3), ABSENT, *theta[3:]])
         return _natural(theta, core)
 
-    def loss(theta: np.ndarray) -> float:
+    def off(theta: np.ndarray) -> np.ndarray:
+        """Deviance residuals: the sum of their squares is least where the likelihood is largest."""
         cdf = growth_cdf(edges, noise, *natural(theta))
-        return -float(counts @ np.log(np.maximum(np.diff(np.concatenate([[0.0], cdf, [1.0]])), 1e-12)))
+        expected = len(growth) * np.maximum(np.diff(np.concatenate([[0.0], cdf, [1.0]])), 1e-12)
+        return np.sign(counts - expected) * np.sqrt(2 * np.maximum(kl_div(counts, expected), 0.0))
 
     excess = growth[growth > middle + 6 * core] - middle
     rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
@@ -141,51 +143,50 @@ def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     start, of_body = np.array(plain), [SKEW] * (middle > 0)
     of_hot = [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
     cool = np.append(start[:FRACTION], [COOL, start[4], ABSENT])
-    cool = _precisely(loss, _likeliest(loss, [cool], of_body, (FRACTION, 4)), (FRACTION, 4))
+    cool = _likeliest(off, [cool], of_body, (FRACTION, 4))
     # Hot pixels beside the body as it is without them, too: a skew may stand for them, or they for it.
-    theta = _likeliest(loss, [start, np.append(cool[:FRACTION], start[FRACTION:])], of_body + of_hot)
-    theta = _precisely(loss, theta)
+    theta = _likeliest(off, [start, np.append(cool[:FRACTION], start[FRACTION:])], of_body + of_hot)
     found = natural(theta)
-    there = len(excess) >= 10 and 2 * (loss(cool) - loss(theta)) >= SIGNIFICANT
+    there = len(excess) >= 10 and _deviance(off, cool) - _deviance(off, theta) >= SIGNIFICANT
     # Many pixels that are hardly warmer than the others are their tail, not hot pixels.
     if not there or found[4] < HOT_FROM * found[0] or found[3] > 0.95 * MOST_HOT:
         theta = cool
     values = np.array(natural(theta))
     units = np.array([core, values[1], 1.0, values[3] * (1 - values[3] / MOST_HOT), values[4], values[5]])
     at_bound = not np.isnan(theta[SKEW]) and values[SKEW] != theta[SKEW]
-    errors = _errors(loss, theta, (SKEW,) if at_bound else ()) * np.where(units > 0, units, 1.0)
+    errors = _errors(off, theta, (SKEW,) if at_bound else ()) * np.where(units > 0, units, 1.0)
     if at_bound:
         errors[SKEW] = 0.0  # held there
     if theta[HOT_SPREAD] >= MOST_HOT_SPREAD:
         errors[HOT_SPREAD] = 0.0  # held there
     if theta is cool:
         values[3:], errors[3:] = 0.0, np.inf
-    alike = _least(loss, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,))
-    if (values[1] < LEAST_SPREAD and values[2] == 0) or 2 * (loss(alike) - loss(theta)) < SIGNIFICANT:
+    alike = _least(off, np.array([theta[0], np.log(1e-3), ABSENT, *theta[3:]]), (1,))
+    if (values[1] < LEAST_SPREAD and values[2] == 0) or _deviance(off, alike) - _deviance(off, theta) < SIGNIFICANT:
         values[1:3], errors[1:3] = 0.0, np.maximum(values[1:3], errors[1:3])
     return values, errors
 
 
-def _likeliest(loss: Loss, starts: list[np.ndarray], shapes: list[int], held: tuple[int, ...] = ()) -> np.ndarray:
+def _likeliest(off: Residuals, starts: list[np.ndarray], shapes: list[int], held: tuple[int, ...] = ()) -> np.ndarray:
     """The numbers that are likeliest, with those of `shapes` that make them significantly likelier.
 
     A small skew is left out: the noise of growth, which is larger where growth is, makes one of 0.04.
     """
 
     def misfit(theta: np.ndarray) -> float:
-        return np.inf if abs(theta[SKEW]) < LEAST_SKEW else 2 * loss(theta) + SIGNIFICANT * len(_free(theta))
+        return np.inf if abs(theta[SKEW]) < LEAST_SKEW else _deviance(off, theta) + SIGNIFICANT * len(_free(theta))
 
-    found = [_least(loss, start, held) for start in starts]
+    found = [_least(off, start, held) for start in starts]
     for of in shapes:
         best = min(found, key=misfit)
         without = [theta for theta in found if np.isnan(theta[of]) and (theta is best or theta is found[0])]
         several = [(theta, value) for theta in without for value in STARTS[of]]
-        found += [_least(loss, np.where(np.arange(len(theta)) == of, value, theta), held) for theta, value in several]
+        found += [_least(off, np.where(np.arange(len(theta)) == of, value, theta), held) for theta, value in several]
     return min(found, key=misfit)
 
 
-def _least(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = (), within: float = ROUGH) -> np.ndarray:
-    """The numbers with the lowest loss, starting from `theta`, within a precision."""
+def _least(off: Residuals, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
+    """The likeliest numbers, starting from `theta`."""
     free = [i for i in _free(theta) if i not in held]
 
     def whole(some: np.ndarray) -> np.ndarray:
@@ -193,13 +194,15 @@ def _least(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = (), within: fl
         out[free] = some
         return out
 
-    options = {"maxiter": MOST_ITERATIONS, "xatol": within, "fatol": 0.02}
-    return whole(minimize(lambda some: loss(whole(some)), theta[free], method="Nelder-Mead", options=options).x)
+    def residuals(some: np.ndarray) -> np.ndarray:
+        return np.append(off(whole(some)), LOOSE * (some - theta[free]))
+
+    return whole(least_squares(residuals, theta[free], **SEARCH).x)
 
 
-def _precisely(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
-    """The same begun again at its end, because the simplex may have shrunk too early."""
-    return _least(loss, theta, held, PRECISE)
+def _deviance(off: Residuals, theta: np.ndarray) -> float:
+    """Twice the difference in log-likelihood from a perfect fit."""
+    return float(np.sum(off(theta) ** 2))
 
 
 def _free(theta: np.ndarray) -> list[int]:
@@ -218,16 +221,17 @@ def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
     return core * max(float(theta[0]), 1e-3), spread, skew, float(fraction), rate, hot_spread
 
 
-def _errors(loss: Loss, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
-    """Standard errors from the curvature of the loss; infinite where it is flat, and of numbers that are not there."""
+def _errors(off: Residuals, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
+    """Standard errors from the curvature of the likelihood; infinite where it is flat, and of numbers not there."""
     free, step = [i for i in _free(theta) if i not in held], 0.02
     n, out = len(free), np.full(len(theta), np.inf)
     hessian = np.empty((n, n))
     unit = step * np.eye(len(theta))[free]
     for i in range(n):
         for j in range(i, n):
-            parts = [loss(theta + a * unit[i] + b * unit[j]) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-            hessian[i, j] = hessian[j, i] = (parts[0] - parts[1] - parts[2] + parts[3]) / (4 * step**2)
+            at = [theta + a * unit[i] + b * unit[j] for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+            parts = [_deviance(off, one) for one in at]
+            hessian[i, j] = hessian[j, i] = (parts[0] - parts[1] - parts[2] + parts[3]) / (8 * step**2)
     values, vectors = np.linalg.eigh(hessian)
     variance = (vectors**2 / np.maximum(values, 1e-9)) @ np.ones(n)
     out[free] = np.sqrt(np.minimum(variance, 1e6))
