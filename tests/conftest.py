@@ -28,6 +28,7 @@ hypothesis.settings.load_profile("hsnoise")
 # Twenty seconds and more each: one that began last would leave the other core idle.
 LONG = (
     "test_docs.py",
+    "test_report_browser.py",
     "test_contaminated.py",
     "test_contract.py",
     "test_loop.py",

@@ -79,7 +79,7 @@ def counted(block, folder, block_info=None):
     return block
 
 
-@pytest.mark.parametrize("frames_of_a_chunk", [1, 4])
+@pytest.mark.parametrize("frames_of_a_chunk", [pytest.param(1, marks=pytest.mark.slow), 4])
 @pytest.mark.parametrize("job", ["budget", "inspect", "compare", "fit"])
 def test_each_frame_is_read_once_or_twice(job, frames_of_a_chunk, differing, tmp_path):
     """And a few of them, at the ends of an exposure, once or twice more, to choose bins and to be checked."""

@@ -132,7 +132,7 @@ def drawn_with(effects, jump_dn=0):
     [
         (hsnoise.effects.FrameOffset(1.0), 4, "black level jumps"),
         (hsnoise.effects.Crosstalk(0.02), 0, "the signal is coupled"),
-        (hsnoise.effects.RandomTelegraphNoise(0.05, 40.0), 0, "Pixels differ"),
+        pytest.param(hsnoise.effects.RandomTelegraphNoise(0.05, 40.0), 0, "Pixels differ", marks=pytest.mark.slow),
     ],
     ids=["offsets", "crosstalk", "telegraph noise"],
 )

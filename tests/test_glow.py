@@ -42,7 +42,7 @@ def test_a_glow_has_its_place_size_and_shape_and_is_no_dark_current(power, rng):
     assert not fit.grave  # frames are drawn for the middle of the sensor, where there is less of the glow
 
 
-@pytest.mark.parametrize("kind", ["gradient", "nothing", "two levels"])
+@pytest.mark.parametrize("kind", ["gradient", "nothing", pytest.param("two levels", marks=pytest.mark.slow)])
 def test_dark_current_that_is_larger_on_one_side_is_no_glow(kind, rng):
     """It multiplies what pixels have; a glow adds the same to all of them."""
     across = np.linspace(0, 1, SHAPE[1])

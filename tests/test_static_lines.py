@@ -43,8 +43,8 @@ def told(sentences: tuple[str, ...], what: str) -> bool:
 @pytest.mark.parametrize(
     ("curve", "pattern_e"),
     [
-        ("none", 0.4),
         ("drift", 0.4),
+        pytest.param("none", 0.4, marks=pytest.mark.slow),
         *(pytest.param(curve, size, marks=pytest.mark.slow) for curve in ("edge", "line") for size in (0.0, 0.4)),
         pytest.param("drift", 0.0, marks=pytest.mark.slow),
     ],
@@ -129,7 +129,10 @@ def of_even_and_odd(rows_e: float, columns_e: float, first_row: int = 0) -> hsno
     return hsnoise.FrameStack(counts, EXPOSURES_S, cfa="mono", shutter="global", white_level=4095, window=window)
 
 
-@pytest.mark.parametrize(("rows_e", "columns_e", "first_row"), [(1.5, 0.0, 0), (-1.2, 0.0, 3), (0.0, 0.0, 0)])
+@pytest.mark.parametrize(
+    ("rows_e", "columns_e", "first_row"),
+    [pytest.param(1.5, 0.0, 0, marks=pytest.mark.slow), (-1.2, 0.0, 3), (0.0, 0.0, 0)],
+)
 def test_even_and_odd_rows_that_differ_are_measured(rows_e, columns_e, first_row):
     stack = of_even_and_odd(rows_e, columns_e, first_row)
     fit = hsnoise.fit(stack)

@@ -41,13 +41,13 @@ def model_of(*effects, cfa="mono"):
 
 
 @lru_cache
-def wild_sensor(cfa="mono", frames=12, shape=(128, 160)):
+def wild_sensor(cfa="mono", frames=12, shape=(128, 160), effects=WILD):
     """Every second frame of a sensor, and the others."""
     blank = [(np.arange(frames * shape[0] * shape[1]) % 50021).astype(np.uint16).reshape(frames, *shape)] * len(
         EXPOSURES_S
     )
     like = hsnoise.FrameStack(blank, EXPOSURES_S, cfa=cfa, shutter="global")
-    whole = draw_capture(77, model_of(*BASE, *WILD, cfa=cfa), like)
+    whole = draw_capture(77, model_of(*BASE, *effects, cfa=cfa), like)
     return tuple(whole.with_counts([of[half::2] for of in whole.counts], None) for half in (0, 1))
 
 
@@ -122,7 +122,7 @@ def test_rows_that_are_read_together_are_no_spectrum():
     assert found.comparison.groups["row x frame"] < 12
 
 
-@pytest.mark.parametrize("charge", [0.0, 20.0])
+@pytest.mark.parametrize("charge", [pytest.param(0.0, marks=pytest.mark.slow), 20.0])
 def test_a_level_that_rises_is_as_noisy_as_its_charge(charge):
     """Pixels gain 30 e-/s by what makes shot noise, or by a pedestal that moves with the exposure."""
     base = [fx.ShotNoise(), fx.DarkCurrent(charge), fx.ReadNoise(4.0), fx.Gain(1.5), fx.BlackLevel(100.0), fx.ADC()]
@@ -246,7 +246,8 @@ def test_flats_of_one_frame_leave_the_response_to_its_law():
     assert "flats, noise" not in found.comparison.groups
 
 
-@pytest.mark.parametrize(("bends", "loss"), [pytest.param("sensor", 6e-6, marks=pytest.mark.slow), ("lamp", 0.0)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("bends", "loss"), [("sensor", 6e-6), ("lamp", 0.0)])
 def test_a_bent_response_is_the_sensors_if_the_noise_of_flats_bends_too(bends, loss):
     exposures_s, shape = np.array([1.0, 2.0, 4.0, 6.0, 8.0, 10.0]), (64, 96)
     truth = model_of(*BASE, fx.Nonlinearity(loss))
@@ -279,7 +280,7 @@ def test_a_story_is_kept_if_its_model_cannot_be_closed(monkeypatch):
         raise ValueError("this sensor has no maps")
 
     monkeypatch.setattr(importlib.import_module("hsnoise.criticism.improve"), "closed", fails)
-    seen, _ = wild_sensor(shape=(64, 80))
+    seen, _ = wild_sensor(effects=(fx.DarkSignalNonuniformity(9.0),))
     story = hsnoise.improve(seen, max_steps=0, close=True)
     assert story.closed is None and story.steps
     assert story.left_open == "Not closed with measured components: this sensor has no maps."

@@ -43,7 +43,7 @@ def split(stack, kept: int):
 
 
 @pytest.mark.parametrize(("truth", "other"), [(ROWS, MODEL), (MODEL, ROWS)])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_true_model_predicts_better(truth, other, seed):
     judge = Judge.of(*split(capture(truth), 6), seed)
     gain = judge.improvement(other, truth, 1)
