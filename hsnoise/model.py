@@ -29,6 +29,7 @@ from hsnoise.chain.arguments import checked_exposure, checked_light, piece_of
 from hsnoise.chain.arrivals import merged
 from hsnoise.chain.effect_json import arrays_of, check_all_taken, effect_from_json, effect_to_json
 from hsnoise.chain.model_file import read_model, write_model
+from hsnoise.chain.shared import Shared
 from hsnoise.chain.signals import apply_by_effect, apply_fenced, apply_in_one, may_scale, signals
 from hsnoise.effects import EFFECTS, AbstractEffect, Capture, Parameter, Stage
 
@@ -298,13 +299,16 @@ def sample_by_effect(
     exposure_s: float | Scalar,
     sensor_key: RandomKey,
     window: Window | None = None,
+    shared: Shared | None = None,
 ) -> Array:
     """As `sample` for [frame, row, column], the same counts up to rounding, but each effect is compiled separately.
 
     It runs somewhat slower, but after adding an effect to a model, only that effect is compiled.
-    window: as in FrameStack, where the frames lie on a larger sensor.
+    window: as in FrameStack, where the frames lie on a larger sensor; shared: what draws of other models may have in
+    common with this one.
     """
-    return apply_by_effect(*_prepared(key, clean, params, exposure_s, sensor_key, window))
+    key, light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key, window)
+    return apply_by_effect(key, light, shape, effects, capture, shared)
 
 
 def dark_signals(
@@ -313,6 +317,17 @@ def dark_signals(
     """The signal after each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
     return signals(*_prepared(key, clean, params, exposure_s, None))
+
+
+def in_session_precision(params: NoiseModel) -> NoiseModel:
+    """The model with numbers of the precision that sampling uses: a fit's are always float64."""
+    dtype = jnp.result_type(float)
+
+    def converted(leaf):
+        wanted = eqx.is_inexact_array(leaf) and leaf.dtype != dtype
+        return jax.lax.convert_element_type(leaf, dtype) if wanted else leaf
+
+    return jax.tree.map(converted, params)
 
 
 def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
@@ -325,11 +340,8 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
     dtype = jnp.result_type(float)
     clean, low, high = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
+    params = in_session_precision(params)
     effects = merged(params.effects, _regime(low, high, params, exposure))
-    # A fit's parameters are always float64; sampling uses the session's precision.
-    numbers, rest = eqx.partition(effects, eqx.is_inexact_array)
-    numbers = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, dtype), numbers)
-    effects = eqx.combine(numbers, rest)
     capture = Capture(
         jnp.asarray(exposure, dtype),
         clean.shape[-2:],
@@ -338,7 +350,7 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
         sensor_key,
         gain=next((effect.value for effect in effects if effect.name == "gain"), None),
         # Read noise may be merged with the arrivals.
-        read_noise=jax.lax.convert_element_type(params["read_noise"].sigma, dtype) if "read_noise" in params else None,
+        read_noise=params["read_noise"].sigma if "read_noise" in params else None,
         window=window,
     )
     shape = (math.prod(clean.shape[:-2]), *capture.shape)

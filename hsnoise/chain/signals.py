@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Hashable
 from functools import partial, reduce
 
 import jax
@@ -12,28 +13,33 @@ import numpy as np
 from hsnoise._core.keys import named_key
 from hsnoise._core.types import NotDeclared
 from hsnoise.chain.arrivals import Arrivals
+from hsnoise.chain.shared import Shared, identity
 from hsnoise.effects import AbstractEffect, Stage
 
 SCALES = ("read_noise_scale", "dark_current_scale")  # the ways in which an effect scales what another draws
 
 
-def apply_by_effect(key, light, shape, effects, capture):
+def apply_by_effect(key, light, shape, effects, capture, shared=None):
     """The signal after the last effect, [frame, row, column]; each effect is compiled separately."""
-    return reduce(lambda _, step: step[1], signals(key, light, shape, effects, capture), jnp.broadcast_to(light, shape))
+    steps = signals(key, light, shape, effects, capture, shared)
+    return reduce(lambda _, step: step[1], steps, jnp.broadcast_to(light, shape))
 
 
-def signals(key, light, shape, effects, capture):
+def signals(key, light, shape, effects, capture, shared: Shared | None = None):
     """Each effect in turn with the signal after it, where `light` (e-, of `shape` or a scalar) falls on the sensor.
 
-    Raises ValueError, naming the effect, if an effect does not return a signal of this shape.
+    shared: what other draws may have in common with this one. Raises ValueError, naming the effect, if an effect does
+    not return a signal of this shape.
     """
-    scales = {what: _scale_of(what, key, effects, capture, shape) for what in SCALES}
+    once = _Anew() if shared is None else _Once(shared, (identity((key, light, capture)), shape))
+    scales = {what: _scale_of(what, key, effects, capture, shape, once) for what in SCALES}
     capture = dataclasses.replace(capture, **scales)
-    of_light = _scale_of("light_scale", key, effects, capture, shape)
+    of_light = _scale_of("light_scale", key, effects, capture, shape, once)
     signal = light if of_light is None else jnp.broadcast_to(light, shape) * of_light
+    seen = {scales: _seen_with(capture, scales) for scales in {effect.scaled_by for effect in effects}}
     for effect in effects:
         try:
-            drawn = _sample_one(key, signal, shape, effect, _of(capture, effect))
+            drawn = once.after(effect, partial(_sample_one, key, signal, shape, effect, seen[effect.scaled_by]))
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise TypeError(
                 f"{effect.name}: JAX cannot compile its sample; use jax.numpy instead of numpy, jnp.where instead of if"
@@ -74,9 +80,9 @@ def apply_fenced(key, light, shape, effects, capture):
     return jax.lax.platform_dependent(key, light, effects, capture, cpu=fenced, default=draw)
 
 
-def _of(capture, effect):
-    """The capture with the scales that the effect uses: its program is then the same whatever other effects scale."""
-    unused = [what for what in SCALES if what not in effect.scaled_by]
+def _seen_with(capture, scales):
+    """The capture with these scales alone: the program of an effect is then the same whatever others scale."""
+    unused = [what for what in SCALES if what not in scales]
     return dataclasses.replace(capture, **{what: NotDeclared(what) for what in unused})
 
 
@@ -85,9 +91,42 @@ def may_scale(what: str, effect: AbstractEffect) -> bool:
     return getattr(type(effect), what) is not getattr(AbstractEffect, what)
 
 
-def _scale_of(what, key, effects, capture, shape):
+class _Anew:
+    """Draws everything."""
+
+    def factor(self, what, effect, draw):
+        return draw()
+
+    def after(self, effect, draw):
+        return draw()
+
+
+class _Once:
+    """Draws what is not `shared` yet. A signal follows from `start`, the factors and the effects up to here."""
+
+    def __init__(self, shared: Shared, start: Hashable):
+        self.shared, self.start = shared, start
+        self.factors: dict[str, tuple] = {}
+        self.trail: Hashable = start
+
+    def factor(self, what, effect, draw):
+        of = (what, identity(effect))
+        self.factors[what] = (*self.factors.get(what, ()), of)
+        return self.shared.get((self.start, of), draw)
+
+    def after(self, effect, draw):
+        used = (*effect.scaled_by, *(["light_scale"] if self.trail is self.start else []))
+        self.trail = self.trail, identity(effect), tuple(self.factors.get(what) for what in used)
+        return self.shared.get(self.trail, draw)
+
+
+def _scale_of(what, key, effects, capture, shape, once):
     """Product of all effects' factors on the read noise or dark current of each pixel; None: 1."""
-    factors = [_factor(what, key, effect, capture, shape) for effect in effects if may_scale(what, effect)]
+    factors = [
+        once.factor(what, effect, partial(_factor, what, key, effect, capture, shape))
+        for effect in effects
+        if may_scale(what, effect)
+    ]
     factors = [factor for factor in factors if factor is not None]
     return reduce(jnp.multiply, factors) if factors else None
 

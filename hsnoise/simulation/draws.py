@@ -12,10 +12,11 @@ import scipy  # its parts are imported when they are used
 from hsnoise._core.keys import key_of, named_key
 from hsnoise._core.naming import named, setting
 from hsnoise._core.types import RandomKey, cfa_tile, channel_index
+from hsnoise.chain.shared import Shared
 from hsnoise.effects import Stage
 from hsnoise.frames.stack import FrameStack
 from hsnoise.likelihood.summary import Summary
-from hsnoise.model import NoiseModel, dark_signals, sample_by_effect
+from hsnoise.model import NoiseModel, dark_signals, in_session_precision, sample_by_effect
 
 MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in another unit
 SURFACE_DEGREE = 3  # of the light on flats
@@ -71,22 +72,35 @@ def black_level_of(model: NoiseModel) -> np.ndarray:
     return np.asarray(model["black_level"].value, float) if "black_level" in model else np.zeros(n)
 
 
-def draw_capture(key: RandomKey | int, model: NoiseModel, like: FrameStack, before: Sequence[int] = ()) -> FrameStack:
+def draw_capture(
+    key: RandomKey | int,
+    model: NoiseModel,
+    like: FrameStack,
+    before: Sequence[int] = (),
+    shared: Shared | None = None,
+) -> FrameStack:
     """A capture drawn from `model` as `like` was taken: one sensor, every frame new, flats in light as bright.
 
     key: a random key, or its seed; before: for each exposure, how many frames of the series come before those of
-    `like`; default: none.
+    `like`; default: none; shared: what draws of other models may have in common with this one.
     """
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor")
     firsts = before or [0] * like.n_exposures
     needed = [first + frames for first, frames in zip(firsts, like.n_frames, strict=True)]
+    sampled = in_session_precision(model)  # once for all exposures
     counts = []
     for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, _alike(needed), strict=True)):
         own = jax.random.fold_in(named_key(key, "frames"), e)
         clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
         drawn = sample_by_effect(
-            own, clean, model, exposure_s=float(exposure_s), sensor_key=sensor_key, window=like.window
+            own,
+            clean,
+            sampled,
+            exposure_s=float(exposure_s),
+            sensor_key=sensor_key,
+            window=like.window,
+            shared=shared,
         )
         counts.append(np.asarray(drawn)[firsts[e] : needed[e]])
     return like.with_counts(counts, like.window)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +14,7 @@ import numpy as np
 from hsnoise._core.keys import key_of, named_key
 from hsnoise._core.threads import in_threads
 from hsnoise._core.types import RandomKey
+from hsnoise.chain.shared import Shared, identity
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, draw_capture
@@ -92,21 +94,33 @@ class Simulator:
         return (values[:, 1:] - values[:, :1]) / np.asarray(steps, float)[:, None]
 
     def _all(self, wanted: Sequence[tuple[NoiseModel, int]]) -> list[Structure]:
-        names = [(_identity(model), number) for model, number in wanted]
+        names = [(identity(model), number) for model, number in wanted]
         new = {name: task for name, task in zip(names, wanted, strict=True) if name not in self.kept}
-        found = in_threads(lambda task: self._draw(*task), new.values(), self.tick)
-        self.kept.update(zip(new, found, strict=True))
+        for found in in_threads(lambda some: self._draw_alike(some, new), _alike(new, os.cpu_count() or 1)):
+            self.kept.update(found)
         return [self.kept[name] for name in names]
 
-    def _draw(self, model: NoiseModel, number: int) -> Structure:
+    def _draw_alike(self, some: Sequence[tuple], tasks: dict) -> dict[tuple, Structure]:
+        """Draws of one number, by name: one after the other, as they have much in common."""
+        shared, found = Shared() if len(some) > 1 else None, {}
+        for name in some:
+            model, number = tasks[name]
+            found[name] = self._draw(model, number, shared)
+            self.tick()
+        return found
+
+    def _draw(self, model: NoiseModel, number: int, shared: Shared | None) -> Structure:
         own = jax.random.fold_in(self.key, number)
-        return self._statistics(draw_capture(own, model, self.portion.frames, self.portion.before))
+        return self._statistics(draw_capture(own, model, self.portion.frames, self.portion.before, shared))
 
     def _statistics(self, frames: FrameStack) -> Structure:
         return structure(frames, black_level_of(self.model)) if self.measure is None else self.measure(frames)
 
 
-def _identity(model: NoiseModel) -> tuple:
-    """What two models share that draw the same."""
-    leaves, form = jax.tree.flatten(model)
-    return form, tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+def _alike(names: Iterable[tuple], threads: int) -> list[list[tuple]]:
+    """The names (of model, number) in pieces of one number each, in order; at least one piece a thread if possible."""
+    groups: dict[int, list[tuple]] = {}
+    for name in names:
+        groups.setdefault(name[1], []).append(name)
+    parts = -(-threads // max(len(groups), 1))
+    return [some for group in groups.values() for i in range(parts) if (some := group[i::parts])]

@@ -41,13 +41,13 @@ def model_of(*effects, cfa="mono"):
 
 
 @lru_cache
-def wild_sensor(cfa="mono", frames=12, shape=(128, 160), effects=WILD):
-    """Every second frame of a sensor, and the others."""
+def wild_sensor(cfa="mono", frames=12, shape=(128, 160), most=None):
+    """Every second frame of a sensor with so many of the WILD effects, and the others."""
     blank = [(np.arange(frames * shape[0] * shape[1]) % 50021).astype(np.uint16).reshape(frames, *shape)] * len(
         EXPOSURES_S
     )
     like = hsnoise.FrameStack(blank, EXPOSURES_S, cfa=cfa, shutter="global")
-    whole = draw_capture(77, model_of(*BASE, *effects, cfa=cfa), like)
+    whole = draw_capture(77, model_of(*BASE, *WILD[:most], cfa=cfa), like)
     return tuple(whole.with_counts([of[half::2] for of in whole.counts], None) for half in (0, 1))
 
 
@@ -280,7 +280,7 @@ def test_a_story_is_kept_if_its_model_cannot_be_closed(monkeypatch):
         raise ValueError("this sensor has no maps")
 
     monkeypatch.setattr(importlib.import_module("hsnoise.criticism.improve"), "closed", fails)
-    seen, _ = wild_sensor(effects=(fx.DarkSignalNonuniformity(9.0),))
+    seen, _ = wild_sensor(most=1)
     story = hsnoise.improve(seen, max_steps=0, close=True)
     assert story.closed is None and story.steps
     assert story.left_open == "Not closed with measured components: this sensor has no maps."
