@@ -83,6 +83,7 @@ def test_a_bend_that_is_not_quite_significant_widens_the_error_of_the_gain(rng):
 
 
 @pytest.mark.parametrize("spread", [pytest.param(0.01, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
 def test_electrons_that_spread_are_no_bent_response(rng, spread):
     """The variance falls as much as where the response bends, but neighbours share what is missing."""
     stack = capture(rng, spread=spread)

@@ -175,6 +175,7 @@ def drawn(model, times=(0.0, 2.0), n=8, shape=(96, 128), seed=3):
     return hsnoise.FrameStack(counts, times, shutter="global")
 
 
+@pytest.mark.slow
 def test_pixels_differ_by_what_they_were_drawn_with():
     found = hsnoise.budget(drawn(sensor()))
     n = 96 * 128

@@ -43,6 +43,7 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     assert told(tmp_path / "file") == ("None", "")
 
 
+@pytest.mark.slow
 def test_the_user_may_say_where_or_that_nothing_is_kept(tmp_path):
     assert told(tmp_path, JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own"))[0] == str(tmp_path / "own")
     told(tmp_path, JAX_COMPILATION_CACHE_DIR="")

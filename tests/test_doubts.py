@@ -131,7 +131,7 @@ def drawn_with(effects, jump_dn=0):
     ("effect", "jump_dn", "says"),
     [
         (hsnoise.effects.FrameOffset(1.0), 4, "black level jumps"),
-        (hsnoise.effects.Crosstalk(0.02), 0, "the signal is coupled"),
+        pytest.param(hsnoise.effects.Crosstalk(0.02), 0, "the signal is coupled", marks=pytest.mark.slow),
         pytest.param(hsnoise.effects.RandomTelegraphNoise(0.05, 40.0), 0, "Pixels differ", marks=pytest.mark.slow),
     ],
     ids=["offsets", "crosstalk", "telegraph noise"],

@@ -38,6 +38,7 @@ def test_few_pixels():
     assert stats.kstest(np.asarray(drawn, float).ravel(), "expon").pvalue > LEAST_P
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_mean_square():
     """E x^2 = a (a + 1), of which a small shape is raised by one and lowered again."""
     for shape in (0.5, 6.0):

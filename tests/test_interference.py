@@ -132,6 +132,7 @@ def harmonics(number, of_row=0.137, of_column=0.271):
     return [((k * of_row + 0.5) % 1 - 0.5, k * of_column % 1) for k in range(1, number + 1)]
 
 
+@pytest.mark.slow
 def test_harmonics_of_a_clock_are_found_beside_the_first_and_drawn():
     rng, frames, sizes = np.random.default_rng(3), 12, (1.2, 0.8, 0.6, 0.5)
     places = [(row, c) if c <= 0.5 else (-row, 1 - c) for row, c in harmonics(4)]

@@ -100,7 +100,7 @@ def test_one_run_of_lit_or_long_frames_tells_no_black_level():
     assert settling_of([run], is_bias=True) is not None
 
 
-@pytest.mark.parametrize(("frames", "exposures"), [(8, 4), (20, 1), (48, 2)])
+@pytest.mark.parametrize(("frames", "exposures"), [(8, 4), (20, 1), pytest.param(48, 2, marks=pytest.mark.slow)])
 def test_white_offsets_are_hardly_ever_taken_for_a_course(frames, exposures):
     rng = np.random.default_rng(3)
     runs = [[rng.normal(0, 1, frames) for _ in range(exposures)] for _ in range(300)]

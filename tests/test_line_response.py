@@ -92,6 +92,7 @@ def test_a_parity_counts_from_the_sensor(rng):
 
 
 @pytest.mark.parametrize("cfa", [pytest.param("mono", marks=pytest.mark.slow), "RGGB"])
+@pytest.mark.slow
 def test_outputs_are_told_from_responses_by_their_noise(rng, cfa):
     """Two outputs whose gains differ make even and odd columns differ in light as two responses do."""
     stack = capture(rng, outputs=0.02, cfa=cfa)

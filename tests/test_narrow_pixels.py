@@ -84,6 +84,7 @@ def test_fits_measure_levels_and_not_counts():
     assert "read_noise_nonuniformity" not in params
 
 
+@pytest.mark.slow
 def test_noise_that_differs_between_narrow_pixels_is_measured():
     rng, shape, laws = np.random.default_rng(7), (256, 256), []
     for spread in (0.0, 0.15, 0.3):

@@ -167,6 +167,7 @@ def test_moments_of_counts_are_those_of_samples():
     assert abs(counts.var() - variance[0, 0]) < 5 * np.sqrt((fourth - counts.var() ** 2) / n)
 
 
+@pytest.mark.slow
 def test_row_spectrum_has_the_power_of_the_row_gain():
     fit = fitted(100.0, "global", True)
     axes = plots.row_spectrum(fit).axes[0]

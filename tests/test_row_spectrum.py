@@ -124,6 +124,7 @@ def test_the_likelihood_rises_to_the_fitted_share(mixture):
     np.testing.assert_allclose(value_and_slope(away)[1], difference, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_fitted_spectrum_is_plotted_with_its_white_share(mixture):
     _, _, free = mixture
     ends = []

@@ -95,6 +95,7 @@ def test_draws_of_one_purpose_come_again_and_those_of_another_seed_do_not():
     assert not np.array_equal(*keys)
 
 
+@pytest.mark.slow
 def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
     """The loop itself: search and refit on the one side, comparison and held-out frames on the other."""
     real, seen = drawing.draw_capture, []

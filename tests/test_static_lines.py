@@ -144,6 +144,7 @@ def test_even_and_odd_rows_that_differ_are_measured(rows_e, columns_e, first_row
     assert fit.conclusion.light == Light.GREEN
 
 
+@pytest.mark.slow
 def test_frames_with_even_and_odd_rows_that_differ_are_like_the_measured_ones():
     """The parity of static rows had no effect in the library: EMVA 1288 set 002 was 62 deviations off."""
     stack = of_even_and_odd(1.5, 0.0)

@@ -211,6 +211,7 @@ def response_of(cfa, shape=(96, 128)):
 
 
 @pytest.mark.parametrize("cfa", [pytest.param("mono", marks=pytest.mark.slow), "RGGB"])
+@pytest.mark.slow
 def test_flats_give_the_response_of_each_pixel(cfa):
     stack = lit_sensor(cfa)
     found = closed(model_of(*BASE, fx.PhotoResponseNonuniformity(0.02), cfa=cfa), stack)

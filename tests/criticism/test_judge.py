@@ -69,6 +69,7 @@ def test_a_series_goes_on_in_the_frames_held_out():
     assert begun_anew.improvement(MODEL, DRIFT, 1).nats < judge.improvement(MODEL, DRIFT, 1).nats - 10
 
 
+@pytest.mark.slow
 def test_two_frames_do_not_show_what_passes_from_one_to_the_next():
     bright = MODEL.add(fx.DarkCurrent(400.0))
     lag = bright.add(fx.ImageLag(0.1))

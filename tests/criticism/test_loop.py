@@ -57,7 +57,7 @@ def test_own_samples_have_error_one():
     ("effect", "group"),
     [
         pytest.param(fx.RowNoise(1.0), {"row x frame", "row spectrum", "noise"}, marks=pytest.mark.slow),
-        (fx.DarkSignalNonuniformity(1.5), {"static pixels", "noise"}),
+        pytest.param(fx.DarkSignalNonuniformity(1.5), {"static pixels", "noise"}, marks=pytest.mark.slow),
         (fx.FrameOffset(1.0), {"frames over time"}),
         pytest.param(fx.ColumnFixedPattern(1.0), {"static columns"}, marks=pytest.mark.slow),
         pytest.param(fx.HotPixels(0.01, 600.0), {"tails", "pixels over time", "static pixels"}, marks=pytest.mark.slow),
