@@ -150,7 +150,7 @@ class Bent:
 class Arcs(Simulator):
     """Draws of it: a model is y itself."""
 
-    def _draw(self, y, number):
+    def _draw(self, y, number, shared=None):
         noise = np.random.default_rng(number).standard_normal(40)
         values = 30 * np.repeat([np.arctan(y[0]), y[1]], 20) + noise
         return Structure(("",) * 40, ("",) * 40, values, np.full(40, 0.3), ())
@@ -178,7 +178,7 @@ class Plain(Bent):
 class Rough(Simulator):
     """Draws of it, whose noise changes with the numbers: slopes between two draws are noisy."""
 
-    def _draw(self, y, number):
+    def _draw(self, y, number, shared=None):
         one, other = np.random.default_rng(number).standard_normal((2, 120))
         angle = 3 * np.sum(y)
         values = np.repeat([3 * y[0], 3 * y[1], 0.0], [10, 10, 100]) + np.cos(angle) * one + np.sin(angle) * other
