@@ -33,8 +33,8 @@ def signals(key, light, shape, effects, capture, shared: Shared | None = None):
     """
     once = _Anew() if shared is None else _Once(shared, (identity((key, light, capture)), shape))
     scales = {what: _scale_of(what, key, effects, capture, shape, once) for what in SCALES}
-    capture = dataclasses.replace(capture, **scales)
     of_light = _scale_of("light_scale", key, effects, capture, shape, once)
+    capture = dataclasses.replace(capture, **scales)
     signal = light if of_light is None else jnp.broadcast_to(light, shape) * of_light
     seen = {scales: _seen_with(capture, scales) for scales in {effect.scaled_by for effect in effects}}
     for effect in effects:
