@@ -32,7 +32,8 @@ MODELS = {
     "one after the gain": BASE.add(fx.RowNoise(3.0, after_gain=True)),
     "one that scales read noise": BASE.add(fx.ReadNoiseNonuniformity(0.5)),
     "one that scales dark current": BASE.add(fx.DarkCurrentNonuniformity(0.5)),
-    "one that scales light": BASE.add(fx.PhotoResponseNonuniformity(0.1)),
+    "one before the photons": BASE.add(fx.PhotoResponseNonuniformity(0.1)),
+    "one that scales light": BASE.add(fx.MeasuredMap(photo_response=np.linspace(0.9, 1.1, 32 * 48).reshape(SHAPE))),
     "another gain": BASE.with_value("gain", "value", 0.6),
     "another dark current": BASE.with_value("dark_current", "rate", 25.0),
 }

@@ -10,17 +10,16 @@ from functools import lru_cache
 from threadpoolctl import ThreadpoolController
 
 
-def in_threads(function: Callable, arguments: Iterable, tick: Callable[[], None] = lambda: None) -> list:
+def number_of_threads() -> int:
+    """How many `in_threads` uses."""
+    return min(os.cpu_count() or 1, 8)
+
+
+def in_threads(function: Callable, arguments: Iterable) -> list:
     """`function(argument)` for each, on all cores; results in order. NumPy and JAX release Python's lock."""
-
-    def one(argument):
-        result = function(argument)
-        tick()
-        return result
-
     # BLAS with threads of its own beside ours would wait for cores that are taken: ten times slower on small matrices.
-    with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        return list(pool.map(one, arguments))
+    with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(number_of_threads()) as pool:
+        return list(pool.map(function, arguments))
 
 
 @lru_cache(maxsize=1)

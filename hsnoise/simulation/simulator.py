@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,7 +11,7 @@ import jax
 import numpy as np
 
 from hsnoise._core.keys import key_of, named_key
-from hsnoise._core.threads import in_threads
+from hsnoise._core.threads import in_threads, number_of_threads
 from hsnoise._core.types import RandomKey
 from hsnoise.chain.shared import Shared, identity
 from hsnoise.frames.stack import FrameStack
@@ -96,7 +95,7 @@ class Simulator:
     def _all(self, wanted: Sequence[tuple[NoiseModel, int]]) -> list[Structure]:
         names = [(identity(model), number) for model, number in wanted]
         new = {name: task for name, task in zip(names, wanted, strict=True) if name not in self.kept}
-        for found in in_threads(lambda some: self._draw_alike(some, new), _alike(new, os.cpu_count() or 1)):
+        for found in in_threads(lambda some: self._draw_alike(some, new), _alike(new, number_of_threads())):
             self.kept.update(found)
         return [self.kept[name] for name in names]
 
