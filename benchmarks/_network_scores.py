@@ -8,7 +8,8 @@ is and scaled in brightness to the truth. A result of a method has its records a
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,12 @@ def scores_of(found: np.ndarray, scaled_to_truth: np.ndarray, scene: Scene) -> l
     ]
 
 
+def keep(path: Path, digest: str, measure: Callable[..., dict[str, Any]], *what: Any) -> None:
+    """Measure and write a file, unless it is there with this digest."""
+    if not (path.exists() and json.loads(path.read_text())["digest"] == digest):
+        write_atomically(path, json.dumps({"digest": digest} | measure(*what), indent=1).encode())
+
+
 def picture_name(scene: Scene) -> str:
     """The file name of a frame of a scene."""
     return f"{scene.clip}-{scene.mean_e:.3g}e.png"
@@ -52,8 +59,8 @@ def with_error(values: Sequence[float], digits: int, sign: str = "") -> str:
     return f"{np.mean(values):{sign}.{digits}f} +- {standard_error(values):.{digits}f}"
 
 
-def tables(results: dict[str, dict[str, Any]], ours: str) -> list[Sheet]:
-    """Scores of each method, and those of `ours` less each other's; standard errors over videos."""
+def tables(results: dict[str, dict[str, Any]], *ours: str) -> list[Sheet]:
+    """Scores of each method, and those of `ours` less each other one's; standard errors over videos."""
     means = {name: {what: of_clips(of["frames"], what) for what in DIGITS} for name, of in results.items()}
 
     def row(name: str, less: str | None = None) -> tuple[str, ...]:
@@ -69,7 +76,8 @@ def tables(results: dict[str, dict[str, Any]], ours: str) -> list[Sheet]:
         return f"{of['parameters']:,}", f"{of['steps']:,}", f"{of['minutes']:.1f}", f"{of['rate']:g}"
 
     own = [(name, *about(of), *row(name)) for name, of in results.items()]
-    less = [(f"{ours} - {name}", *row(ours, name)) for name in results if name != ours and ours in results]
+    others = [name for name in results if name not in ours]
+    less = [(f"{one} - {name}", *row(one, name)) for one in ours if one in results for name in others]
     first = ("network", "parameters", "steps", "minutes", "rate", *HEADS)
     sheets = Sheet("Held-out clips", first, own), Sheet("Differences, paired over clips", ("networks", *HEADS), less)
     return [sheet for sheet in sheets if sheet.rows]

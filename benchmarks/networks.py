@@ -38,7 +38,7 @@ import optax
 from rich.console import Console
 
 from benchmarks._network_figures import draw_scene, draw_scores
-from benchmarks._network_scores import csv_of, picture_name, scores_of, tables, write_picture
+from benchmarks._network_scores import csv_of, keep, picture_name, scores_of, tables, write_picture
 from benchmarks.rivals.fastdvdnet import FastDVDnet
 from benchmarks.rivals.ffdnet import FFDNet
 from benchmarks.rivals.kpn import KPN
@@ -49,7 +49,7 @@ from hsnoise._core.output import write_atomically, write_figure
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
-from hsnoise.enhance.training.evaluate import Method, check_weights, prepared
+from hsnoise.enhance.training.evaluate import Method, check_weights, prepared, through_both_ways
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of, noise_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
 from hsnoise.enhance.training.rivals import Denoiser, rivals
@@ -62,7 +62,7 @@ from hsnoise.enhance.weights import load_network, read_arrays, write_arrays
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, loss
 
-OURS, WEIGHTS = "ST-LSTM", "weights"
+OURS, WEIGHTS, BOTH_WAYS = "ST-LSTM", "weights", "weights both ways"
 RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
 MINUTES = 10.0  # of a training
 RATES = (3e-4, 1e-3, 3e-3)
@@ -220,6 +220,10 @@ def _of_scene(net: Any, scene: Scene) -> np.ndarray:
     return np.asarray(_enhanced(net, scene.noisy))
 
 
+def _both_ways(net: Any, scene: Scene) -> np.ndarray:
+    return through_both_ways(lambda noisy: np.asarray(_enhanced(net, noisy[:, 0]))[:, None], scene)
+
+
 def tested(method: Method, scenes: Sequence[Scene], shown: Path) -> list[dict[str, Any]]:
     """Scores of each frame of all scenes. method: display values of a scene; shown: folder for their last frames."""
     shown.mkdir(parents=True, exist_ok=True)
@@ -283,9 +287,10 @@ def measures(
             "frames": tested(lambda scene: np.asarray(display_from_linear(scene.noisy)), scenes, folders[1] / REFER)
         }
 
-    def of_weights() -> dict[str, Any]:
+    def of_weights(name: str) -> dict[str, Any]:
         net = Ours(load_network(options.weights)[0])
-        return {"frames": tested(partial(_of_scene, net), scenes, folders[1] / WEIGHTS)}
+        method = _of_scene if name == WEIGHTS else _both_ways
+        return {"frames": tested(partial(method, net), scenes, folders[1] / name)}
 
     digests = setting.noise_digest, setting.digest
     found = [
@@ -293,7 +298,8 @@ def measures(
     ]
     if options.weights is not None:
         of_file = f"{digests[1]}-{hashlib.sha256(options.weights.read_bytes()).hexdigest()[:8]}"
-        found.append(partial(keep, folders[1] / f"{WEIGHTS}.json", of_file, of_weights))
+        names = WEIGHTS, BOTH_WAYS
+        found += [partial(keep, folders[1] / f"{name}.json", of_file, of_weights, name) for name in names]
     if options.untrained:
         found.append(partial(keep, folders[1] / f"{REFER}.json", digests[1], of_input))
         for name, denoise in rivals().items():
@@ -301,18 +307,12 @@ def measures(
     return folders, found
 
 
-def keep(path: Path, digest: str, measure: Callable[..., dict[str, Any]], *what: Any) -> None:
-    """Measure and write a file, unless it is there with this digest."""
-    if not (path.exists() and json.loads(path.read_text())["digest"] == digest):
-        write_atomically(path, json.dumps({"digest": digest} | measure(*what), indent=1).encode())
-
-
 def write_tables(folders: tuple[Path, Path], ours: str, out: Path) -> tuple[dict[str, Path], list[Sheet]]:
     """Files of all scores in these folders by method, and tables of them; tables and scores are written to `out`."""
     of_methods = {path.stem: path for folder in folders for path in sorted(folder.glob("*.json"))}
     of_methods = {name: of_methods[name] for name in sorted(of_methods, key=lambda name: name != ours)}
     results = {name: json.loads(path.read_text()) for name, path in of_methods.items()}
-    sheets = tables(results, ours)
+    sheets = tables(results, ours, BOTH_WAYS)
     write_atomically(out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
     write_atomically(out / "networks.csv", csv_of(results).encode())
     return of_methods, sheets

@@ -11,7 +11,8 @@ LSTMs", NeurIPS 2017 (cell).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -26,6 +27,7 @@ LAYOUT = ("NHWC", "HWIO", "NHWC")
 FORGET_BIAS = 1.0
 MOST_LAYERS = 64  # the paper has 4; a file that declares thousands would keep a reader busy for hours
 REACH = 16  # blocks beyond a tile that the network sees
+FILLED = 6  # frames after which its memory of a video hardly grows
 L2, L1, PERCEPTUAL, TOTAL_VARIATION = 5.0, 1.0, 0.06, 2e-6  # weights of equation 10
 
 
@@ -255,7 +257,12 @@ def from_blocks(x: jax.Array, stride: int) -> jax.Array:
 
 
 def enhance(
-    net: STLSTM, frames: Iterable[np.ndarray], *, tile: int | None = None, margin: int | None = None
+    net: STLSTM,
+    frames: Iterable[np.ndarray],
+    *,
+    tile: int | None = None,
+    margin: int | None = None,
+    look_ahead: int = 0,
 ) -> Iterator[np.ndarray]:
     """Enhance a video of any length in constant memory.
 
@@ -265,28 +272,79 @@ def enhance(
             whole frames where the network sees no further than `margin` pixels beyond a tile.
         margin: overlap of tiles in pixels, a multiple of the stride; default: 16 strides, more than the reach of a
             frame and the few before it.
+        look_ahead: so many frames that follow help each frame, too: the network also goes through them backward, and
+            the two results are averaged. This takes three times as long. 0: each frame leaves before the next comes in.
 
     Raises:
-        ValueError: a tile or margin that is not a multiple of the stride; frames that change size.
+        ValueError: a tile or margin that is not a multiple of the stride; frames that change size; a negative
+            look_ahead.
     """
     margin = REACH * net.stride if margin is None else margin
     if tile is not None and (tile <= 0 or tile % net.stride or margin < 0 or margin % net.stride):
         raise ValueError(f"tile, margin: expected multiples of the stride {net.stride}, got {tile}, {margin}")
-    step = eqx.filter_jit(lambda net, frame, state: net(frame, state))
-    states: dict[tuple[int, ...], State] = {}
+    whole_number("look_ahead", look_ahead, 0)
+    begin = partial(_Pass, net, eqx.filter_jit(lambda net, frame, state: net(frame, state)), tile, margin)
+    frames = _of_one_size(frames)
+    if not look_ahead:
+        yield from map(begin(), frames)
+        return
+    forward, seen, held = begin(), 0, []
+    for frame in frames:
+        held.append((frame, forward(frame)))
+        if len(held) == 2 * look_ahead:
+            yield from _merged(held, begin(), seen)[:look_ahead]
+            seen, held = seen + look_ahead, held[look_ahead:]
+    yield from _merged(held, begin(), seen)
+
+
+def _of_one_size(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for number, frame in enumerate(map(np.asarray, frames)):
         if shape is not None and frame.shape != shape:
             raise ValueError(f"frames: frame {number} has shape {frame.shape}, those before {shape}")
         shape = frame.shape
-        out = np.empty(shape, np.float32)
-        for whole, inner, target in _tiles(shape[:2], tile, margin):
+        yield frame
+
+
+class _Pass:
+    """The network on its way through frames of one size, tile by tile."""
+
+    def __init__(self, net: STLSTM, step: Callable, tile: int | None, margin: int):
+        self.net, self.step, self.tile, self.margin = net, step, tile, margin
+        self.states: dict[tuple[int, ...], State] = {}
+
+    def __call__(self, frame: np.ndarray) -> np.ndarray:
+        """The next frame [row, column, channel], enhanced."""
+        out = np.empty(frame.shape, np.float32)
+        for whole, inner, target in _tiles(frame.shape[:2], self.tile, self.margin):
             part = jnp.asarray(frame[whole], jnp.float32)
             place = tuple(of.start for of in target)
-            state = states.get(place) or net.init_state(part.shape[:2])
-            enhanced, states[place] = step(net, part, state)
+            state = self.states.get(place) or self.net.init_state(part.shape[:2])
+            enhanced, self.states[place] = self.step(self.net, part, state)
             out[target] = np.asarray(enhanced)[inner]
-        yield out
+        return out
+
+
+def _merged(held: list[tuple[np.ndarray, np.ndarray]], backward: _Pass, seen: int) -> list[np.ndarray]:
+    """Results of held frames: what they became forward, after `seen` others, averaged with a pass backward."""
+    after = [backward(frame) for frame, _ in reversed(held)][::-1]
+    shares = [np.float32(share_of_past(seen + i + 1, len(held) - i)) for i in range(len(held))]
+    return [a * one + (1 - a) * other for a, (_, one), other in zip(shares, held, after, strict=True)]
+
+
+def share_of_past(seen, ahead):
+    """Weight of a frame's result forward, after `seen` frames, beside that backward, after `ahead`, both with it."""
+    past = np.minimum(seen, FILLED)
+    return past / (past + np.minimum(ahead, FILLED))
+
+
+def both_ways(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Results of a whole video [time, ...] forward and backward, both in the order of time, averaged as `enhance` does
+    with frames that follow.
+    """
+    seen = np.arange(1, len(before) + 1)
+    share = share_of_past(seen, seen[::-1]).astype(before.dtype).reshape(-1, *[1] * (before.ndim - 1))
+    return share * before + (1 - share) * after
 
 
 def _tiles(shape: tuple[int, int], tile: int | None, margin: int) -> Iterator[tuple[tuple[slice, ...], ...]]:

@@ -232,6 +232,11 @@ def test_differences_are_paired_over_clips():
     own, apart = tables(of, OURS)
     assert own.rows[0][5] == "25.00 +- 5.00"
     assert apart.rows == [("ST-LSTM - KPN", "+2.00 +- 0.00", "+2.000 +- 0.000", "+2.00 +- 0.00", "+2.000 +- 0.000")]
+    of["again"] = result([("a", 21.0), ("b", 31.0)])
+    assert [row[:2] for row in tables(of, OURS, "again")[1].rows] == [
+        ("ST-LSTM - KPN", "+2.00 +- 0.00"),
+        ("again - KPN", "+3.00 +- 0.00"),
+    ]
 
 
 def test_a_training_ends_with_its_steps_or_its_minutes():

@@ -13,7 +13,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsnoise.stlstm import LAYOUT, STLSTM, Convolution, convolve, enhance, from_blocks, loss, to_blocks, total_variation
+from hsnoise.stlstm import (
+    LAYOUT,
+    STLSTM,
+    Convolution,
+    both_ways,
+    convolve,
+    enhance,
+    from_blocks,
+    loss,
+    to_blocks,
+    total_variation,
+)
 
 KEY = jax.random.key(2)
 
@@ -95,6 +106,44 @@ def test_tiles_are_the_whole_frame_where_nothing_beyond_their_margin_is_seen():
     # In two frames the network sees 2 x (3 x 3 and its output) blocks of two pixels: less than 24 pixels.
     for one, other in zip(whole, tiled, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("tile", [None, 8])
+def test_frames_that_follow_help_as_those_before(tile):
+    frames = video(7, (8, 10), seed=4)[:, 0]
+    net = small_net()
+
+    def forward(some):
+        return list(enhance(net, some, tile=tile))
+
+    before, after = forward(frames), forward(frames[::-1])[::-1]
+    whole = list(enhance(net, frames, tile=tile, look_ahead=7))
+    np.testing.assert_allclose(whole, both_ways(np.array(before), np.array(after)), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(whole[0], (before[0] + 6 * after[0]) / 7, rtol=1e-5, atol=1e-6)  # seen: 1; at most 6
+    pieces = list(enhance(net, iter(frames), tile=tile, look_ahead=2))
+    assert len(pieces) == 7
+    # The first two are seen with those up to the fourth.
+    third = forward(frames[3::-1])[::-1][1]
+    np.testing.assert_allclose(pieces[1], (2 * before[1] + 3 * third) / 5, rtol=1e-5, atol=1e-6)
+    # After six frames the memory counts as full: the last of the middle has seen 4, and 4 from the end.
+    sixth = forward(frames[:1:-1])[::-1][2]
+    np.testing.assert_allclose(pieces[4], (5 * before[4] + 3 * sixth) / 8, rtol=1e-5, atol=1e-6)
+
+
+def test_a_frame_leaves_as_soon_as_those_it_looks_ahead_to_are_there():
+    taken = []
+
+    def frames():
+        for frame in video(9, (8, 8))[:, 0]:
+            taken.append(frame)
+            yield frame
+
+    for look_ahead, most in ((0, 1), (2, 4)):
+        taken.clear()
+        next(enhance(small_net(), frames(), look_ahead=look_ahead))
+        assert len(taken) == most
+    with pytest.raises(ValueError, match="look_ahead"):
+        next(enhance(small_net(), frames(), look_ahead=-1))
 
 
 def test_tiles_that_the_stride_does_not_divide_are_refused():

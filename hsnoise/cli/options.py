@@ -280,4 +280,11 @@ def _enhance_arguments(commands: Any) -> None:
         metavar="PIXELS",
         help="work in tiles of this size (a multiple of the network's stride) to save memory: 256, say",
     )
+    enhance.add_argument(
+        "--look-ahead",
+        type=int,
+        default=0,
+        metavar="N",
+        help="see N following frames of each, too: less noise, in three times the time (default 0; 8 helps a lot)",
+    )
     enhance.add_argument("--rate", type=float, default=25, help="frames per second if IN states none (default 25)")

@@ -26,6 +26,7 @@ from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import Split, split_of
 from hsnoise.enhance.training.steps import digest_of
 from hsnoise.enhance.training.tables import (
+    BOTH_WAYS,
     OURS,
     REFER,
     SCALED,
@@ -38,7 +39,7 @@ from hsnoise.enhance.training.tables import (
 )
 from hsnoise.enhance.training.validation import psnr_db
 from hsnoise.enhance.weights import load_network
-from hsnoise.stlstm import STLSTM
+from hsnoise.stlstm import STLSTM, both_ways
 
 LEVELS = 3
 LEAST_CROP, LEAST_FRAMES = 8, 3
@@ -120,12 +121,19 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
     found: dict[str, Method] = {
         REFER: lambda scene: np.asarray(display_from_linear(scene.noisy)),
         OURS: lambda scene: net(scene.noisy[:, None])[:, 0],
+        BOTH_WAYS: partial(through_both_ways, net),
     }
     if untrained and not_installed():
         _note(f"{' and '.join(not_installed())} are left out: pip install 'hsnoise[peers]'")
     for name, denoise in rivals().items() if untrained else ():
         found[name] = prepared(name, denoise, tuning)
     return found
+
+
+def through_both_ways(net, scene: Scene) -> np.ndarray:
+    """Display values of a scene by a network [time, batch, ...] that sees the frames that follow, too."""
+    noisy = scene.noisy[:, None]
+    return both_ways(net(noisy), net(noisy[::-1])[::-1])[:, 0]
 
 
 def prepared(name: str, denoise: Denoiser, tuning: Scene) -> Method:

@@ -18,6 +18,8 @@ from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.validation import psnr_db
 
 REFER, OURS, SCALED = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, scaled"
+BOTH_WAYS = "hsnoise ST-LSTM both ways, scaled"  # with the frames that follow
+OF_HSNOISE = (OURS, SCALED, BOTH_WAYS)
 FORMS = {"psnr_db": ".2f", "ssim": ".3f"}
 SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
 InWords = Callable[[float], str]  # the light of a scene from `mean_e`
@@ -57,7 +59,7 @@ def both(records: Sequence[dict], **chosen) -> str:
 
 def best_rival(records: Sequence[dict], what: str) -> str:
     """The method with the highest mean, our own aside."""
-    rivals = [method for method in methods_in(records) if method not in (OURS, SCALED)]
+    rivals = [method for method in methods_in(records) if method not in OF_HSNOISE]
     return max(rivals, key=lambda method: np.mean(list(of_clips(records, what, method=method).values())))
 
 
@@ -100,7 +102,7 @@ def _ahead(records: Sequence[dict], in_words: InWords) -> Sheet:
             *(in_figures(lead(records, method, what, mean_e=light), f"+{FORMS[what]}") for light in lights),
         )
         for what, name in (("psnr_db", "PSNR / dB"), ("ssim", "SSIM"))
-        for method in (OURS, SCALED)
+        for method in OF_HSNOISE
     ]
     head = ("method", "best rival", "all light", *map(in_words, lights))
     return Sheet("Ahead of the best rival, clip by clip", head, rows, left=2)
@@ -150,7 +152,7 @@ def draw_curves(records: Sequence[dict], filling: dict[str, list[float]], in_wor
     lights, longest = lights_in(records), of_longest(records)
     frames = sorted({record["frame"] for record in longest})
     for method, marker in zip(methods_in(records), "so*vDXP", strict=False):
-        style = {"label": method, "alpha": 0.8, "lw": 2.5 if method in (OURS, SCALED) else 1.2}
+        style = {"label": method, "alpha": 0.8, "lw": 2.5 if method in OF_HSNOISE else 1.2}
         of = [list(of_clips(records, "psnr_db", method=method, mean_e=light).values()) for light in lights]
         errors = [standard_error(values) for values in of]
         against_light.errorbar(lights, [np.mean(values) for values in of], errors, fmt=f"{marker}-", capsize=3, **style)
