@@ -283,7 +283,12 @@ def enhance(
     if tile is not None and (tile <= 0 or tile % net.stride or margin < 0 or margin % net.stride):
         raise ValueError(f"tile, margin: expected multiples of the stride {net.stride}, got {tile}, {margin}")
     whole_number("look_ahead", look_ahead, 0)
-    begin = partial(_Pass, net, eqx.filter_jit(lambda net, frame, state: net(frame, state)), tile, margin)
+
+    @eqx.filter_jit
+    def step(net, frame, state):
+        return net(frame, state)
+
+    begin = partial(_Pass, net, step, tile, margin)
     frames = _of_one_size(frames)
     if not look_ahead:
         yield from map(begin(), frames)
