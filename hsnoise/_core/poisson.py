@@ -51,10 +51,15 @@ ERFINV_TAIL = (
 
 def pixel_words(key: jax.Array, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
     """Two random words (uint32) for each pixel of `shape` (frames, rows, columns): Threefry-2x32 of 20 rounds."""
+    frame, row, column = (jax.lax.broadcasted_iota(jnp.uint32, shape, axis) for axis in range(3))
+    return words_at(key, frame, row * np.uint32(shape[2]) + column)
+
+
+def words_at(key: jax.Array, frame: jax.Array, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The words that `pixel_words` has in these frames at these pixels, counted along rows (uint32, of one shape)."""
     first, second = jax.random.bits(key, (2,), jnp.uint32)
     keys = (first, second, first ^ second ^ PARITY)
-    frame, row, column = (jax.lax.broadcasted_iota(jnp.uint32, shape, axis) for axis in range(3))
-    a, b = frame + keys[0], row * np.uint32(shape[2]) + column + keys[1]
+    a, b = frame + keys[0], pixel + keys[1]
     for i in range(5):
         for rotation in ROTATIONS[i % 2]:
             a = a + b
@@ -84,6 +89,11 @@ def poisson_of_bits(bits: jax.Array, mean: jax.Array, regime: Regime = "any") ->
         summed = (mean < FEW_BELOW) | (count < SUM_TERMS)
         count = jnp.where(summed, count, _by_normal(uniform, jnp.maximum(mean, FEW_BELOW)))
     return jnp.where(mean > 0, count, 0.0)
+
+
+def uniform_of_bits(bits: jax.Array) -> jax.Array:
+    """Uniform numbers above 0, float32, from all of the random bits (uint32): small ones are as fine as large ones."""
+    return (bits.astype(jnp.float32) + 0.5) * jnp.float32(2.0**-32)
 
 
 def normal_of_bits(bits: jax.Array) -> jax.Array:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.poisson import pixel_words, uniform_of_bits
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
@@ -44,14 +45,13 @@ class CosmicRays(AbstractEffect):
     )
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        where, again, how_much = jax.random.split(key, 3)
         probability = -jnp.expm1(-1e-6 * (self.rate * capture.exposure_s + self.at_readout))
-        # Two uniform numbers for one: those of float32 have steps of 1e-7, and hits may be a thousand times rarer.
-        root = jnp.sqrt(probability)
-        one, other = (jax.random.uniform(key, signal.shape, signal.dtype) for key in (where, again))
-        hit = (one < root) & (other < root)
-        charge = jnp.round(self.charge * jax.random.exponential(how_much, signal.shape, signal.dtype))
-        return signal + jnp.where(hit, charge, 0)
+        # Two numbers for one: hits may be rarer than a word of 32 bits can tell.
+        root = jnp.sqrt(jax.lax.stop_gradient(probability))
+        one, other = (uniform_of_bits(word).astype(signal.dtype) for word in pixel_words(key, signal.shape))
+        # Where a number lies below the root, it is uniform up to there.
+        charge = jnp.round(-self.charge * jnp.log(one / jnp.maximum(root, 1e-30)))
+        return signal + jnp.where((one < root) & (other < root), charge, 0)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:

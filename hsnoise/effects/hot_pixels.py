@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits, uniform_of_bits, words_at
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import AbstractEffect, Capture, Stage, draw_poisson
+from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
-PAIRS, KINDS = 1, 2  # what sets the random keys of electrons that come in pairs, and of kinds of defects, apart
+PIECES, LEAST_PIECE = 32, 64  # of the sensor: its hot pixels are drawn piece by piece
 
 
 class HotPixels(AbstractEffect):
@@ -57,21 +58,37 @@ class HotPixels(AbstractEffect):
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(capture.fixed_key(self.name))
-        shape = (1, *signal.shape[1:])
-        hot = jax.random.uniform(where, shape, signal.dtype) < self.fraction
-        strength = jax.random.exponential(how_much, shape, signal.dtype)
-        kind = jax.random.normal(jax.random.fold_in(how_much, KINDS), shape, signal.dtype)
-        strength = strength * jnp.exp(self.spread * kind - self.spread**2 / 2)
-        mean = jnp.where(hot, strength * (self.rate * capture.exposure_s + self.at_readout), 0)
-        in_pairs = 2 * (1 - self.fano)
-        single = draw_poisson(key, (1 - in_pairs) * mean, signal.shape)
-        steps, phase = jax.random.split(jax.random.fold_in(key, PAIRS))
+        frames, pixels = len(signal), signal[0].size
+        hot = uniform_of_bits(pixel_words(where, (1, *signal.shape[1:]))[0]).ravel() < self.fraction
+        so_far = jnp.cumsum(hot.astype(jnp.int32))
+        charge = jax.lax.stop_gradient(self.rate * capture.exposure_s + self.at_readout)
+        number = jnp.where(charge > 0, so_far[-1], 0)
+        piece = min(pixels, max(pixels // PIECES, LEAST_PIECE))
+        frame = jax.lax.broadcasted_iota(jnp.uint32, (frames, piece), 0)
 
-        def second_steps():
-            begun = jax.random.bernoulli(phase, 0.5, signal.shape)
-            return jnp.floor((draw_poisson(steps, 2 * in_pairs * mean, signal.shape) + begun) / 2)
+        def one_more(state):
+            """Draw the next hot pixels: they are few, and the others need no numbers."""
+            done, drawn = state
+            at = jnp.searchsorted(so_far, done + 1 + jnp.arange(piece, dtype=jnp.int32)).astype(jnp.uint32)
+            mean = charge * self._strength(*words_at(how_much, jnp.zeros_like(at), at))
+            electrons = self._electrons(*words_at(key, frame, at[None]), mean[None])
+            return done + piece, drawn.at[:, at].set(electrons.astype(drawn.dtype), mode="drop")
 
-        return signal + single + jax.lax.cond(in_pairs > 0, second_steps, lambda: jnp.zeros_like(signal))
+        begun = jnp.zeros_like(number), jnp.zeros((frames, pixels), signal.dtype)
+        drawn = jax.lax.while_loop(lambda state: state[0] < number, one_more, begun)[1]
+        return signal + drawn.reshape(signal.shape)
+
+    def _strength(self, first: jax.Array, second: jax.Array) -> jax.Array:
+        """Charge of hot pixels over their mean charge, from two random words for each."""
+        spread = jax.lax.stop_gradient(self.spread)
+        return -jnp.log(uniform_of_bits(first)) * jnp.exp(spread * normal_of_bits(second) - spread**2 / 2)
+
+    def _electrons(self, first: jax.Array, second: jax.Array, mean: jax.Array) -> jax.Array:
+        """Electrons, from two random words for each."""
+        in_pairs = 2 * (1 - jax.lax.stop_gradient(self.fano))
+        # The lowest bit tells whether the first hole came before the exposure; counts follow from the highest ones.
+        steps = poisson_of_bits(second, 2 * in_pairs * mean) + (second & 1)
+        return poisson_of_bits(first, (1 - in_pairs) * mean) + jnp.where(in_pairs > 0, jnp.floor(steps / 2), 0.0)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:

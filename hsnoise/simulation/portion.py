@@ -17,6 +17,7 @@ from hsnoise.statistics.structure import check_size
 
 MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and draws slower
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
+WHOLE_COLUMNS = 16  # their number is a multiple: Fourier transforms of large primes take twice as long
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
 MOST_SATURATED = 0.2  # share of a flat's pixels
 LINEAR = 0.7  # of saturation: the range in which EMVA 1288 takes photon transfer for a line
@@ -58,7 +59,8 @@ class Portion:
         kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
         first = 0
         if kept < columns:
-            first, kept = (columns - kept) // 4 * 2, kept // 2 * 2
+            kept = kept // WHOLE_COLUMNS * WHOLE_COLUMNS
+            first = (columns - kept) // 4 * 2
         end = min(first + kept, columns)
         part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
         bright = [i for i in range(part.n_exposures) if is_saturated(part, i)]
