@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits
+from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits, uniform_of_bits, words_at
 
 CELLS = 2**23
 
@@ -92,3 +92,18 @@ def test_regimes_agree(mean, regime):
     bits = jnp.arange(CELLS, dtype=jnp.uint32) << 9
     jitted = jax.jit(poisson_of_bits, static_argnums=2)
     np.testing.assert_array_equal(jitted(bits, jnp.float32(mean), regime), jitted(bits, jnp.float32(mean)))
+
+
+def test_uniform_numbers_are_above_zero_and_as_fine_near_it():
+    bits = jnp.asarray([0, 1, 2, 2**20, 2**31, 2**32 - 1], jnp.uint32)
+    found = np.asarray(uniform_of_bits(bits), float)
+    np.testing.assert_allclose(found, (np.asarray(bits, float) + 0.5) / 2**32, rtol=1e-6)
+    assert 0 < found[0] < found[1] < found[2] and found[-1] <= 1
+
+
+def test_words_of_single_pixels_are_those_of_all():
+    key = jax.random.key(5)
+    every = pixel_words(key, (3, 5, 7))
+    frame, pixel = jnp.asarray([[0], [2]], jnp.uint32), jnp.asarray([[0, 11, 34]], jnp.uint32)
+    for one, other in zip(words_at(key, frame, pixel), every, strict=True):
+        np.testing.assert_array_equal(one, other.reshape(3, -1)[np.asarray(frame), np.asarray(pixel)])

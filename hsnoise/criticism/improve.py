@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-import numpy as np
-
 from hsnoise._core.arguments import callback, seed_of
 from hsnoise._core.events import Event, counter
 from hsnoise.criticism import rules, sentences
@@ -322,17 +320,20 @@ class _Work:
         gain = self.judged(judge, steps, found, effect.name)
         if isinstance(gain, Refusal):
             return gain
-        first = found
         if has_sides(effect):
             side = next(side for side in Side if side != side_of(effect))
             other = self.fitted_with(steps, on_side(effect, side), "the same on the other side of the gain")
             if other is not None:
                 scores = [score_of_side(one.params, self.portion, self.seed) for one in (found, other)]
-                found, ahead = (found, other)[int(np.argmax(scores))], abs(scores[0] - scores[1])
+                ahead = abs(scores[0] - scores[1])
+                if scores[1] > scores[0]:
+                    found, gain = other, self.judged(judge, steps, other, effect.name)
+        if isinstance(gain, Refusal):
+            return gain
         result = self.tried(found.finished, effect) if isinstance(found, Draft) else found
         if result is None:
             return Refusal(Refused.NOT_FITTED)
-        if result is not first:
+        if isinstance(found, Draft) and not found.has_settled:  # its last step may lead elsewhere
             gain = self.judged(judge, steps, result, effect.name)
         return gain if isinstance(gain, Refusal) else (result, gain, ahead)
 

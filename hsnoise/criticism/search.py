@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import given
-from hsnoise.criticism.fingerprint import DRAWN_ERROR, NEARBY_ERROR, Bench
+from hsnoise.criticism.fingerprint import DRAWN_ERROR, NEARBY_ERROR, RELATIVE_ERROR, Bench
 from hsnoise.criticism.outcomes import Side, has_sides, on_side
 from hsnoise.criticism.ranking import (
     CLOSE,
@@ -89,15 +89,20 @@ class Search:
         return _best_first(again.get(one.of.name, one) for one in judged)
 
     def closer(self, judged: list[Judged]) -> list[Judged]:
-        """The leaders with parameters closer to the capture: fingerprints bend, and strong effects show it."""
-        leaders = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
+        """The leaders with parameters closer to the capture: fingerprints bend, and strong effects show it.
+
+        Those that are close already stay as they are.
+        """
+        near = [one for one in judged[:LEADERS] if one.score > NEAR * judged[0].score]
+        leaders = [one for one in near if one.of.error == RELATIVE_ERROR]
         wanted = {one.of.name: (one.of.maker, (one.amplitude,)) for one in leaders}
         prints = self.bench.fingerprints(wanted, MANY_DETAILS)
         varied = [judge(replace(of, error=DRAWN_ERROR), self.evidence, of.amplitudes[0] * AROUND_IT) for of in prints]
         again = [self.drawn_close(one.candidate(self.evidence).effect) for one in varied]
         # Not against the leaders as they were: in few draws, rare counts seem to scatter less than they do.
         better = [max(pair, key=lambda one: one.score) for pair in zip(varied, again, strict=True)]
-        return _best_first([*better, *judged[len(leaders) :]])
+        names = {one.of.name for one in leaders}
+        return _best_first([*better, *(one for one in judged if one.of.name not in names)])
 
     def drawn_close(self, effect: AbstractEffect) -> Judged:
         """An effect with parameters brought closer to the capture, judged by many draws there."""

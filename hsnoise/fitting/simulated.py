@@ -91,6 +91,11 @@ class Draft:
         """Names of the fitted numbers."""
         return (*self.problem.base.names, *self.problem.added.names)
 
+    @property
+    def has_settled(self) -> bool:
+        """Whether a step more hardly moves it."""
+        return self.last_step < LONG_STEP
+
     def finished(self) -> FitResult:
         """The fit, by one step more and with standard errors."""
         y, covariance = self.after_last_step()

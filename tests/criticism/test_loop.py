@@ -313,18 +313,26 @@ def test_only_what_holds_is_tried_on_the_other_side(monkeypatch, scores, side):
     assert work.with_one_more([], effect, None) is refusal and len(fitted) == 3
 
 
+def draft_of(last_step):
+    return Draft(None, None, None, None, None, last_step, 5)
+
+
 def test_a_fit_is_finished_only_if_it_holds_so_far(monkeypatch):
     """Its standard errors take almost half of the draws."""
-    draft, whole, seen = Draft(*[None] * 7), SimpleNamespace(), []
+    draft, whole, seen = draft_of(0.1), SimpleNamespace(), []
     refusal, gain = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1)), Improvement(30.0, 2.0, 1)
-    of = {id(draft): refusal, id(whole): gain}
+    of = {id(draft): refusal}
     monkeypatch.setattr(_Work, "fitted_with", lambda *of: draft)
     monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: of[id(fit)])
     monkeypatch.setattr(Draft, "finished", lambda self: seen.append(self) or whole)
     work, effect = _Work(None, None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
     assert work.with_one_more([], effect, None) is refusal and not seen
-    of |= {id(draft): gain, id(whole): refusal}
-    assert work.with_one_more([], effect, None) is refusal and seen == [draft]
+    of[id(draft)] = gain
+    assert work.with_one_more([], effect, None)[:2] == (whole, gain) and seen == [draft]
+    # One that has not settled is judged again when it is finished.
+    draft = draft_of(2.0)
+    of = {id(draft): gain, id(whole): refusal}
+    assert work.with_one_more([], effect, None) is refusal
     of[id(whole)] = better = Improvement(31.0, 2.0, 1)
     assert work.with_one_more([], effect, None)[:2] == (whole, better)
 
@@ -333,6 +341,22 @@ def test_a_fit_is_finished_only_if_it_holds_so_far(monkeypatch):
 
     monkeypatch.setattr(Draft, "finished", fails)
     assert work.with_one_more([], effect, None) == Refusal(Refused.NOT_FITTED)
+
+
+def test_the_likelier_side_of_the_gain_is_judged_and_kept(monkeypatch):
+    first, other = draft_of(0.1), draft_of(0.1)
+    drafts, judged = iter([first, other, first, other]), []
+    gain = Improvement(30.0, 2.0, 1)
+    monkeypatch.setattr(_Work, "fitted_with", lambda *of: next(drafts))
+    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: judged.append(fit) or gain)
+    monkeypatch.setattr(Draft, "finished", lambda self: self)
+    monkeypatch.setattr(Draft, "params", None)
+    scores = iter([5.0, 2.0, 2.0, 6.0])
+    module = importlib.import_module("hsnoise.criticism.improve")
+    monkeypatch.setattr(module, "score_of_side", lambda *of: next(scores))
+    work = _Work(None, None, None, 0, lambda event: None)
+    assert work.with_one_more([], fx.FrameOffset(2.0), None) == (first, gain, 3.0) and judged == [first]
+    assert work.with_one_more([], fx.FrameOffset(2.0), None) == (other, gain, 4.0) and judged[1:] == [first, other]
 
 
 def test_what_was_tried_in_vain_is_told_with_the_reason():

@@ -168,12 +168,26 @@ def test_cosmic_rays_are_rare_new_and_exponential():
     assert abs(hit.sum() - per_pixel * hit.size) < 5 * np.sqrt(per_pixel * hit.size)
     charge = drawn[hit] + np.random.default_rng(0).uniform(-0.5, 0.5, hit.sum())
     assert stats.kstest(charge / 900, "expon").pvalue > P_VALUE
-    assert hit.sum(0).max() <= 2
+    assert hit.sum(0).max() <= 3  # one pixel of a thousand such captures is hit four times
     counts = hit.sum((1, 2))
     assert stats.chi2.sf(np.sum((counts - counts.mean()) ** 2) / counts.mean(), frames - 1) > P_VALUE
     assert np.all(darks(CosmicRays(2000.0, 900.0), 2, shape, exposure_s=0.0) == 0)
     at_readout = (darks(CosmicRays(0.0, 900.0, 1000.0), frames, shape, exposure_s=0.0) > 0).sum()
     assert abs(at_readout - per_pixel * hit.size) < 5 * np.sqrt(per_pixel * hit.size)
+
+
+@pytest.mark.parametrize("fraction", [0.003, 0.3, 1.0])
+def test_hot_pixels_are_the_same_in_pieces_of_any_size(fraction, monkeypatch):
+    drawn = []
+    for pieces in (1, 8, 1000):
+        monkeypatch.setattr("hsnoise.effects.hot_pixels.PIECES", pieces)
+        effect = HotPixels(fraction, 40.0, 3.0, 0.8, 0.5)
+        capture = Capture(jnp.float32(0.5), (60, 70), "mono", "rolling", jax.random.key(3))
+        drawn.append(np.asarray(effect.sample(jnp.zeros((5, 60, 70), jnp.float32), capture, key=KEY)))
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    np.testing.assert_array_equal(drawn[0], drawn[2])
+    share = (drawn[0] > 0).any(0).mean()
+    assert 0.6 * fraction - 0.002 < share <= fraction + 4 * np.sqrt(fraction / 4200)
 
 
 def test_glow_has_a_finite_derivative_in_its_spot():
