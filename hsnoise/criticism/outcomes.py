@@ -59,6 +59,11 @@ class Improvement:
         """Whether it is beyond the scatter of its simulation, and beyond chance."""
         return self.nats - self.cost > rules.PREDICTS + rules.PREDICTS_SIGMA * self.error
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it is beyond chance, but not beyond the scatter of its simulation: more draws would tell."""
+        return not self.holds and self.nats - self.cost > rules.PREDICTS
+
 
 @dataclass(frozen=True)
 class Refusal:

@@ -141,3 +141,19 @@ def test_flats_are_judged_on_the_part_of_the_sensor_that_was_held_out():
     assert with_flats(whole.select(exposures=[0]), whole.select(exposures=[1])).shape == (64, 160)
     fitted, held_out = split_frames(darks, whole)
     assert Judge.of(fitted, held_out, 0).portion.frames.kind == ("dark", "flat")
+
+
+@pytest.mark.parametrize(
+    ("nats", "error", "draws"),
+    [(2.0, 9.0, [40]), (60.0, 9.0, [40]), (15.0, 9.0, [40, 80]), (9.0, 9.0, [40, 80, 160]), (-5.0, 9.0, [40])],
+)
+def test_more_is_drawn_only_where_draws_do_not_tell(nats, error, draws, monkeypatch):
+    made = []
+
+    def improvement(simulator, before, after, number, cost):
+        made.append(number)
+        return Improvement(nats, error * 40 / number, cost)
+
+    monkeypatch.setattr(of_frames, "_improvement", improvement)
+    Judge.of(*split(capture(MODEL), 6), 0).improvement(MODEL, ROWS, 1)
+    assert made == draws
