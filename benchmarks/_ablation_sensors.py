@@ -95,4 +95,13 @@ def sensors(folder: Path) -> dict[str, Callable[[], Sensor]]:
         unseen = np.stack([whole.frame(many, f) for f in range(half, whole.n_frames[many])])
         return Sensor("emva001", fitted, unseen, float(whole.exposure_s[many]))
 
-    return {"imx541": imx541, "stl1001": stl1001, "tc237": tc237, "emva001": emva001}
+    def st8() -> Sensor:
+        # Two of the seven darks of 25 s are unseen.
+        whole = hsnoise.load(folder / "sbig_st8_cc0", progress=False).select(rows=slice(128))
+        longest = int(np.argmax(whole.exposure_s))
+        kept = whole.n_frames[longest] - 2
+        fitted = whole.select(frames=[slice(kept if e == longest else None) for e in range(whole.n_exposures)])
+        unseen = np.stack([whole.frame(longest, f) for f in range(kept, kept + 2)])
+        return Sensor("st8", fitted, unseen, float(whole.exposure_s[longest]))
+
+    return {"imx541": imx541, "stl1001": stl1001, "tc237": tc237, "emva001": emva001, "st8": st8}
