@@ -59,7 +59,7 @@ class HotPixels(AbstractEffect):
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         where, how_much = jax.random.split(capture.fixed_key(self.name))
         frames, pixels = len(signal), signal[0].size
-        hot = uniform_of_bits(pixel_words(where, (1, *signal.shape[1:]))[0]).ravel() < self.fraction
+        hot = uniform_of_bits(pixel_words(where, (1, *signal.shape[1:]))[0]).ravel() <= self.fraction
         so_far = jnp.cumsum(hot.astype(jnp.int32))
         charge = jax.lax.stop_gradient(self.rate * capture.exposure_s + self.at_readout)
         number = jnp.where(charge > 0, so_far[-1], 0)
