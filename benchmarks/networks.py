@@ -49,7 +49,7 @@ from hsnoise._core.output import write_atomically, write_figure
 from hsnoise._core.sheet import Sheet
 from hsnoise.chain.photometry import display_from_linear
 from hsnoise.enhance.training.clips import Batch, Clip, check_sizes, crops, read_clips
-from hsnoise.enhance.training.evaluate import Method, check_weights, prepared, through_both_ways
+from hsnoise.enhance.training.evaluate import Method, at_its_best, check_weights, prepared
 from hsnoise.enhance.training.noisy import JITTER, Camera, Shape, camera_of, noise_of
 from hsnoise.enhance.training.protocol import middle_of, scaled_to
 from hsnoise.enhance.training.rivals import Denoiser, rivals
@@ -62,7 +62,7 @@ from hsnoise.enhance.weights import load_network, read_arrays, write_arrays
 from hsnoise.model import NoiseModel
 from hsnoise.stlstm import STLSTM, loss
 
-OURS, WEIGHTS, BOTH_WAYS = "ST-LSTM", "weights", "weights both ways"
+OURS, WEIGHTS, AT_BEST = "ST-LSTM", "weights", "weights both ways, mirrored"
 RIVALS: dict[str, type[Rival]] = {"FFDNet": FFDNet, "KPN": KPN, "TOFlow": TOFlow, "FastDVDnet": FastDVDnet}
 MINUTES = 10.0  # of a training
 RATES = (3e-4, 1e-3, 3e-3)
@@ -220,8 +220,8 @@ def _of_scene(net: Any, scene: Scene) -> np.ndarray:
     return np.asarray(_enhanced(net, scene.noisy))
 
 
-def _both_ways(net: Any, scene: Scene) -> np.ndarray:
-    return through_both_ways(lambda noisy: np.asarray(_enhanced(net, noisy[:, 0]))[:, None], scene)
+def _at_its_best(net: Any, scene: Scene) -> np.ndarray:
+    return at_its_best(lambda noisy: np.asarray(_enhanced(net, noisy[:, 0]))[:, None], scene)
 
 
 def tested(method: Method, scenes: Sequence[Scene], shown: Path) -> list[dict[str, Any]]:
@@ -289,7 +289,7 @@ def measures(
 
     def of_weights(name: str) -> dict[str, Any]:
         net = Ours(load_network(options.weights)[0])
-        method = _of_scene if name == WEIGHTS else _both_ways
+        method = _of_scene if name == WEIGHTS else _at_its_best
         return {"frames": tested(partial(method, net), scenes, folders[1] / name)}
 
     digests = setting.noise_digest, setting.digest
@@ -298,7 +298,7 @@ def measures(
     ]
     if options.weights is not None:
         of_file = f"{digests[1]}-{hashlib.sha256(options.weights.read_bytes()).hexdigest()[:8]}"
-        names = WEIGHTS, BOTH_WAYS
+        names = WEIGHTS, AT_BEST
         found += [partial(keep, folders[1] / f"{name}.json", of_file, of_weights, name) for name in names]
     if options.untrained:
         found.append(partial(keep, folders[1] / f"{REFER}.json", digests[1], of_input))
@@ -312,7 +312,7 @@ def write_tables(folders: tuple[Path, Path], ours: str, out: Path) -> tuple[dict
     of_methods = {path.stem: path for folder in folders for path in sorted(folder.glob("*.json"))}
     of_methods = {name: of_methods[name] for name in sorted(of_methods, key=lambda name: name != ours)}
     results = {name: json.loads(path.read_text()) for name, path in of_methods.items()}
-    sheets = tables(results, ours, BOTH_WAYS)
+    sheets = tables(results, ours, AT_BEST)
     write_atomically(out / "networks.md", "\n".join(sheet.markdown() for sheet in sheets).encode())
     write_atomically(out / "networks.csv", csv_of(results).encode())
     return of_methods, sheets

@@ -263,6 +263,7 @@ def enhance(
     tile: int | None = None,
     margin: int | None = None,
     look_ahead: int = 0,
+    mirrored: bool = False,
 ) -> Iterator[np.ndarray]:
     """Enhance a video of any length in constant memory.
 
@@ -274,6 +275,8 @@ def enhance(
             frame and the few before it.
         look_ahead: so many frames that follow help each frame, too: the network also goes through them backward, and
             the two results are averaged. This takes three times as long. 0: each frame leaves before the next comes in.
+        mirrored: average with the result of the mirrored frames, mirrored back (Lim, Son, Kim, Nah, Lee, "Enhanced deep
+            residual networks for single image super-resolution", CVPR workshops 2017). This takes twice as long.
 
     Raises:
         ValueError: a tile or margin that is not a multiple of the stride; frames that change size; a negative
@@ -288,7 +291,7 @@ def enhance(
     def step(net, frame, state):
         return net(frame, state)
 
-    begin = partial(_Pass, net, step, tile, margin)
+    begin = partial(_Pass, net, step, tile, margin, mirrored)
     frames = _of_one_size(frames)
     if not look_ahead:
         yield from map(begin(), frames)
@@ -314,16 +317,20 @@ def _of_one_size(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
 class _Pass:
     """The network on its way through frames of one size, tile by tile."""
 
-    def __init__(self, net: STLSTM, step: Callable, tile: int | None, margin: int):
+    def __init__(self, net: STLSTM, step: Callable, tile: int | None, margin: int, mirrored: bool):
         self.net, self.step, self.tile, self.margin = net, step, tile, margin
+        self.views = (1, -1) if mirrored else (1,)  # directions of columns
         self.states: dict[tuple[int, ...], State] = {}
 
     def __call__(self, frame: np.ndarray) -> np.ndarray:
         """The next frame [row, column, channel], enhanced."""
+        return np.mean([self._of_view(frame[:, ::view], view)[:, ::view] for view in self.views], axis=0)
+
+    def _of_view(self, frame: np.ndarray, view: int) -> np.ndarray:
         out = np.empty(frame.shape, np.float32)
         for whole, inner, target in _tiles(frame.shape[:2], self.tile, self.margin):
             part = jnp.asarray(frame[whole], jnp.float32)
-            place = tuple(of.start for of in target)
+            place = view, *(of.start for of in target)
             state = self.states.get(place) or self.net.init_state(part.shape[:2])
             enhanced, self.states[place] = self.step(self.net, part, state)
             out[target] = np.asarray(enhanced)[inner]
@@ -344,9 +351,7 @@ def share_of_past(seen, ahead):
 
 
 def both_ways(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Results of a whole video [time, ...] forward and backward, both in the order of time, averaged as `enhance` does
-    with frames that follow.
-    """
+    """Results [time, ...] forward and backward, both in the order of time, averaged as `enhance` does."""
     seen = np.arange(1, len(before) + 1)
     share = share_of_past(seen, seen[::-1]).astype(before.dtype).reshape(-1, *[1] * (before.ndim - 1))
     return share * before + (1 - share) * after

@@ -41,7 +41,7 @@ def seen(monkeypatch):
     """The light that comes to the network."""
     frames = []
 
-    def keep(net, light, tile, look_ahead):
+    def keep(net, light, **how):
         frames.extend(light)
         return iter(frames)
 
@@ -49,7 +49,7 @@ def seen(monkeypatch):
     return frames
 
 
-@pytest.mark.parametrize("more", [[], ["--tile", "8", "--brighten", "2"], ["--look-ahead", "2"]])
+@pytest.mark.parametrize("more", [[], ["--tile", "8", "--brighten", "2"], ["--look-ahead", "2", "--mirrored"]])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_video_is_enhanced(place, capsys, channels, more):
     out = place / "out.mp4"
@@ -71,7 +71,7 @@ def test_without_weights_those_that_come_with_hsnoise_are_taken(place, capsys):
 
 
 def test_a_built_in_camera_has_its_own_weights(place, capsys, monkeypatch):
-    monkeypatch.setattr("hsnoise.cli.enhance.enhance", lambda net, frames, tile, look_ahead: iter([]))
+    monkeypatch.setattr("hsnoise.cli.enhance.enhance", lambda net, frames, **how: iter([]))
     model = hsnoise.cameras.grasshopper3()
     counts = np.asarray(hsnoise.sample(0, np.full((2, 16, 24), 2.0, np.float32), model))
     np.savez(place / "g.npz", counts=counts[None], exposure_s=[0.03], cfa=model.cfa)
@@ -132,7 +132,7 @@ def test_raw_frames_are_divided_by_the_unit_of_the_weights(place, seen):
 
 
 def test_nothing_is_left_of_a_run_that_is_terminated(place, monkeypatch):
-    def ended(net, light, tile, look_ahead):
+    def ended(net, light, **how):
         yield next(light)
         os.kill(os.getpid(), signal.SIGTERM)
         yield next(light)

@@ -130,6 +130,20 @@ def test_frames_that_follow_help_as_those_before(tile):
     np.testing.assert_allclose(pieces[4], (5 * before[4] + 3 * sixth) / 8, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("tile", [None, 8])
+def test_mirrored_frames_are_averaged_with(tile):
+    frames, net = video(3, (8, 12), seed=5)[:, 0], small_net()
+
+    def through(some, **how):
+        return np.array(list(enhance(net, some, tile=tile, **how)))
+
+    for look_ahead in (0, 3):
+        plain, turned = (through(some, look_ahead=look_ahead) for some in (frames, frames[:, :, ::-1]))
+        found = through(frames, look_ahead=look_ahead, mirrored=True)
+        np.testing.assert_allclose(found, (plain + turned[:, :, ::-1]) / 2, rtol=1e-5, atol=1e-6)
+        assert np.abs(found - plain).max() > 1e-4
+
+
 def test_a_frame_leaves_as_soon_as_those_it_looks_ahead_to_are_there():
     taken = []
 

@@ -47,7 +47,8 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     _check_network(args, net, about, camera)
     light = _of_display(args, net) if camera is None else _of_counts(args, camera, about.get("unit_e"))
     console = Console(stderr=True)
-    frames = enhance(net, _noted(light, about), tile=args.tile, look_ahead=args.look_ahead)
+    how = {"tile": args.tile, "look_ahead": args.look_ahead, "mirrored": args.mirrored}
+    frames = enhance(net, _noted(light, about), **how)
     shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
     rate = frame_rate_of(args.video, args.rate)
     sweep(args.out.parent)

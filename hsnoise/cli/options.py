@@ -287,4 +287,7 @@ def _enhance_arguments(commands: Any) -> None:
         metavar="N",
         help="see N following frames of each, too: less noise, in three times the time (default 0; 8 helps a lot)",
     )
+    enhance.add_argument(
+        "--mirrored", action="store_true", help="average with mirrored frames: a little better, in twice the time"
+    )
     enhance.add_argument("--rate", type=float, default=25, help="frames per second if IN states none (default 25)")

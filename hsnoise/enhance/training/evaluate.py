@@ -26,7 +26,7 @@ from hsnoise.enhance.training.scenes import Scene, scene_of
 from hsnoise.enhance.training.split import Split, split_of
 from hsnoise.enhance.training.steps import digest_of
 from hsnoise.enhance.training.tables import (
-    BOTH_WAYS,
+    AT_BEST,
     OURS,
     REFER,
     SCALED,
@@ -121,7 +121,7 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
     found: dict[str, Method] = {
         REFER: lambda scene: np.asarray(display_from_linear(scene.noisy)),
         OURS: lambda scene: net(scene.noisy[:, None])[:, 0],
-        BOTH_WAYS: partial(through_both_ways, net),
+        AT_BEST: partial(at_its_best, net),
     }
     if untrained and not_installed():
         _note(f"{' and '.join(not_installed())} are left out: pip install 'hsnoise[peers]'")
@@ -130,10 +130,13 @@ def methods_of(net, tuning: Scene, untrained: bool) -> dict[str, Method]:
     return found
 
 
-def through_both_ways(net, scene: Scene) -> np.ndarray:
-    """Display values of a scene by a network [time, batch, ...] that sees the frames that follow, too."""
-    noisy = scene.noisy[:, None]
-    return both_ways(net(noisy), net(noisy[::-1])[::-1])[:, 0]
+def at_its_best(net, scene: Scene) -> np.ndarray:
+    """Display values of a scene by a network [time, batch, ...] that sees the frames that follow and mirrored ones."""
+    noisy, seen = scene.noisy[:, None], []
+    for view in (1, -1):
+        frames = noisy[:, :, :, ::view]
+        seen.append(both_ways(net(frames), net(frames[::-1])[::-1])[:, 0, :, ::view])
+    return (seen[0] + seen[1]) / 2
 
 
 def prepared(name: str, denoise: Denoiser, tuning: Scene) -> Method:

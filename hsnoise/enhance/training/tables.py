@@ -18,8 +18,8 @@ from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.validation import psnr_db
 
 REFER, OURS, SCALED = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, scaled"
-BOTH_WAYS = "hsnoise ST-LSTM both ways, scaled"  # with the frames that follow
-OF_HSNOISE = (OURS, SCALED, BOTH_WAYS)
+AT_BEST = "hsnoise ST-LSTM, both ways, mirrored, scaled"  # with the frames that follow
+OF_HSNOISE = (OURS, SCALED, AT_BEST)
 FORMS = {"psnr_db": ".2f", "ssim": ".3f"}
 SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
 InWords = Callable[[float], str]  # the light of a scene from `mean_e`
