@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -24,12 +26,15 @@ ABSENT, STARTS = np.nan, {SKEW: (0.5, -0.5), HOT_SPREAD: (np.log(0.5),)}
 SEARCH = {"x_scale": "jac", "diff_step": 1e-4, "ftol": 1e-7, "xtol": 1e-6, "gtol": None, "max_nfev": 60}
 LOOSE = 1e-3  # weight with which numbers stay where they start: some tell nothing, as a skew beyond its bounds
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
-HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # of the means of hot pixels; largest logarithm of their spread
+HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # over hot pixels' means, and what others have; largest log of their spread
+LEAST_NOISE = 1e-3  # over the width of ordinary pixels
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
 LOGS = np.linspace(-30.0, 30.0, 601)  # of skewed dark currents, in units of their spread
 MOST_SKEW, MOST_TAIL = 2.0, 0.45  # of either sign; skew times spread: the variance is infinite from 0.5 on
 LEAST_WEIGHT = 1e-9  # of nodes that count
 AS_NORMAL, LEAST_SKEW = 0.01, 0.1  # below which the logarithm is normal; which counts
+NOISE_RANGE, NOISE_GROUPS, FEWEST_IN_GROUP = (0.02, 0.98), 8, 200  # quantiles of growth at which its noise is measured
+MEDIAN_VARIANCE, SURE_SLOPE = 5.4, 5.0  # relative variance of a squared median deviation, times pixels; standard errors
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
 SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ in dark current
@@ -38,9 +43,43 @@ MOST_HOT, COOL = 0.3, -25.0  # largest share of hot pixels, and the logit that s
 HOT_FROM = 2.0  # mean extra of hot pixels, over the mean of the others
 
 
+class Noise(NamedTuple):
+    """Noise of the measured growth of a pixel: standard deviation without any, and variance per growth (shot noise)."""
+
+    still: float
+    per_growth: float = 0.0
+
+    def at(self, growth: np.ndarray | float) -> np.ndarray | float:
+        """Standard deviation."""
+        return np.sqrt(self.still**2 + self.per_growth * np.maximum(growth, 0.0))
+
+
+def noise_of(halves: np.ndarray) -> Noise:
+    """Of the mean growth of two halves of the frames [half, pixel], from how far they are apart, jumps and hits aside.
+
+    The same for all pixels where it does not clearly rise with growth.
+    """
+    growth, apart = halves.mean(0), np.abs(halves[0] - halves[1] - np.median(halves[0] - halves[1])) / 2
+    edges = np.quantile(growth, np.linspace(*NOISE_RANGE, NOISE_GROUPS + 1))
+    groups = [np.flatnonzero((growth >= low) & (growth < high)) for low, high in pairwise(edges)]
+    groups = [group for group in groups if len(group) >= FEWEST_IN_GROUP]
+    usual = Noise(1.4826 * float(np.median(apart)))
+    if len(groups) < 2:
+        return usual
+    x = np.array([np.median(growth[group]) for group in groups])
+    variance = np.array([(1.4826 * np.median(apart[group])) ** 2 for group in groups])
+    sigma = np.maximum(variance * np.sqrt(MEDIAN_VARIANCE / np.array([len(group) for group in groups])), 1e-300)
+    design = np.stack([np.ones_like(x), x], 1) / sigma[:, None]
+    covariance = np.linalg.pinv(design.T @ design)
+    still, slope = covariance @ design.T @ (variance / sigma)
+    if slope <= SURE_SLOPE * np.sqrt(covariance[1, 1]) or still + slope * max(x.min(), 0.0) <= 0:
+        return usual
+    return Noise(float(np.sqrt(max(still, 0.0))), float(slope))
+
+
 def growth_cdf(
     x: np.ndarray,
-    noise: float,
+    noise: Noise,
     mean: float,
     spread: float,
     skew: float,
@@ -53,18 +92,28 @@ def growth_cdf(
     spread, skew: of ln growth; hot_spread: standard deviation of ln of the hot pixels' mean.
     """
     width = mean * relative_width(spread, skew)
-    plain = (_wide_noise if noise > WIDE * width else _narrow_noise)(x, noise, mean, spread, skew)
+    plain = (_wide_noise if noise.at(mean) > WIDE * width else _narrow_noise)(x, noise, mean, spread, skew)
     if fraction <= 0:
         return plain
-    # Next to so wide an extra, the ordinary part of hot pixels can be taken as normal.
-    width = float(np.hypot(noise, width))
-    z, weight = normal_nodes(HOT_NODES) if hot_spread > 0 else (np.zeros(1), np.ones(1))
-    off = (x[:, None] - mean) / width
-    warm = ndtr(off) - _exponential_share(off, width / (rate * np.exp(hot_spread * z - hot_spread**2 / 2)))
-    return (1 - fraction) * plain + fraction * (warm @ weight)
+    z, of_kind = normal_nodes(HOT_NODES) if hot_spread > 0 else (np.zeros(1), np.ones(1))
+    body, of_body = _bodies(spread, skew)
+    usual = max(float(noise.at(mean)), LEAST_NOISE * width, 1e-12)
+    off = ((x[:, None] - mean * body) / usual)[:, :, None]
+    warm = ndtr(off) - _exponential_share(off, usual / (rate * np.exp(hot_spread * z - hot_spread**2 / 2)))
+    return (1 - fraction) * plain + fraction * ((warm @ of_kind) @ of_body)
 
 
-def _wide_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew: float) -> np.ndarray:
+def _bodies(spread: float, skew: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ordinary dark currents of hot pixels, over their mean, and weights: few, as the extra is wide."""
+    z, weight = normal_nodes(HOT_NODES)
+    if skew == 0:
+        return np.exp(spread * z - spread**2 / 2), weight
+    of_logs = _of_logs(skew)
+    logs = np.interp(ndtr(z), np.cumsum(of_logs) - of_logs / 2, LOGS)
+    return np.exp(spread * logs) / (of_logs @ np.exp(spread * LOGS)), weight
+
+
+def _wide_noise(x: np.ndarray, noise: Noise, mean: float, spread: float, skew: float) -> np.ndarray:
     """Share of ordinary pixels below x, by nodes over their dark currents."""
     if skew == 0:
         z, weight = normal_nodes(NODES)
@@ -73,13 +122,16 @@ def _wide_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew: f
         there = (weight := _of_logs(skew)) > LEAST_WEIGHT
         body, weight = np.exp(spread * LOGS[there]), weight[there] / weight[there].sum()
         body /= weight @ body
-    return ndtr((x[:, None] - mean * body) / noise) @ weight
+    return ndtr((x[:, None] - mean * body) / noise.at(mean * body)) @ weight
 
 
-def _narrow_noise(x: np.ndarray, noise: float, mean: float, spread: float, skew: float) -> np.ndarray:
+def _narrow_noise(x: np.ndarray, noise: Noise, mean: float, spread: float, skew: float) -> np.ndarray:
     """The same by nodes over the noise: narrow noise would leave steps between those over the dark currents."""
     z, weight = normal_nodes(NODES)
-    logs = np.log(np.maximum(x[:, None] - noise * z, 1e-300) / mean) / spread
+    # Without noise the growth g that z of its standard deviations leave at x: g + z noise(g) = x.
+    shift = noise.per_growth * z / 2
+    still = x[:, None] + z * (shift - np.sqrt(np.maximum(noise.still**2 + noise.per_growth * x[:, None] + shift**2, 0)))
+    logs = np.log(np.maximum(still, 1e-300) / mean) / spread
     if skew == 0:
         return ndtr(logs + spread / 2) @ weight
     of_logs = _of_logs(skew)
@@ -114,7 +166,7 @@ def _exponential_share(off: np.ndarray, ratio: float | np.ndarray) -> np.ndarray
     return np.where(inner > -25.0, low, np.exp(np.minimum(ratio**2 / 2 - ratio * off, 0.0)))
 
 
-def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+def fitted(growth: np.ndarray, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """(mean, spread, skew, fraction, rate, hot spread) of the growth [pixel], and errors; zeros for what is not
     significant."""
     middle = float(np.median(growth))
@@ -170,7 +222,7 @@ def fitted(growth: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
 def _likeliest(off: Residuals, starts: list[np.ndarray], shapes: list[int], held: tuple[int, ...] = ()) -> np.ndarray:
     """The numbers that are likeliest, with those of `shapes` that make them significantly likelier.
 
-    A small skew is left out: the noise of growth, which is larger where growth is, makes one of 0.04.
+    A small skew is left out: it is hardly ever real.
     """
 
     def misfit(theta: np.ndarray) -> float:

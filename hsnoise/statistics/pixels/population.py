@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
-from hsnoise.statistics.pixels.dark_currents import fitted, growth_cdf, relative_width
+from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf, noise_of, relative_width
 from hsnoise.statistics.pixels.sample import of_neighbours
 
 APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by more, it is a hit or a jump
@@ -72,7 +72,8 @@ def population_of(
     growth = growth[steady].astype(np.float64)
     # A pedestal that falls faster than the dark signal rises is common to all pixels: growth is measured from it.
     fallen = min(float(np.median(growth)), 0.0)
-    values, errors = fitted(growth - fallen, noise)
+    of_growth = noise_of(halves[:, steady].astype(np.float64))
+    values, errors = fitted(growth - fallen, of_growth)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[3:], errors[3:] = 0.0, np.inf
     body, spread, skew, fraction, rate, hot_spread = values
@@ -80,7 +81,7 @@ def population_of(
     beyond = 0.0
     if fraction > 0:
         # The log-normal tail above the limit belongs to the ordinary pixels; hot pixels below it do not.
-        beyond = body - _mean_below(limit - pedestal_dn_per_s - fallen, noise, values)
+        beyond = body - _mean_below(limit - pedestal_dn_per_s - fallen, of_growth, values)
     total = float(growth.mean())
     if fraction > 0 and total <= below + beyond:  # the log-normal's tail holds more than all pixels have
         fraction = values[3] = 0.0
@@ -148,7 +149,7 @@ def warm_of(off: np.ndarray) -> Warm | None:
     noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
         return None
-    values, errors = fitted(extra, noise)
+    values, errors = fitted(extra, Noise(noise))
     if values[3] <= 0:
         return None
     return Warm(*((float(values[i]), float(errors[i])) for i in (3, 4, 5)))
@@ -166,9 +167,9 @@ def _as_cold(halves: np.ndarray, limit: float) -> bool:
     return bool(below.sum() > MOST_COLD * above.sum())
 
 
-def _mean_below(limit: float, noise: float, values: np.ndarray) -> float:
+def _mean_below(limit: float, noise: Noise, values: np.ndarray) -> float:
     """Mean measured growth of the pixels below a limit, under the fitted distribution."""
-    x = np.linspace(min(-8 * noise, limit - 1e-9), limit, 400)
+    x = np.linspace(min(-8 * float(noise.at(values[0])), limit - 1e-9), limit, 400)
     cdf = growth_cdf(x, noise, *values)
     return float(limit - np.trapezoid(cdf, x) / max(cdf[-1], 1e-12))
 
