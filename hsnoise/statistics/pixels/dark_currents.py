@@ -28,6 +28,7 @@ LOOSE = 1e-3  # weight with which numbers stay where they start: some tell nothi
 FEWEST_IN_TAIL = 100  # hot pixels from which the shape of their distribution is fitted
 HOT_NODES, MOST_HOT_SPREAD = 12, 0.9  # over hot pixels' means, and what others have; largest log of their spread
 LEAST_NOISE = 1e-3  # over the width of ordinary pixels
+LEAST_MEAN = 1e-3  # of ordinary pixels, over the width of all growth: with less they have no dark current
 NODES = 48  # over the log-normal distribution, or over the noise if that is narrower
 LOGS = np.linspace(-30.0, 30.0, 601)  # of skewed dark currents, in units of their spread
 MOST_SKEW, MOST_TAIL = 2.0, 0.45  # of either sign; skew times spread: the variance is infinite from 0.5 on
@@ -173,12 +174,13 @@ def fitted(growth: np.ndarray, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     core = 1.4826 * float(np.median(np.abs(growth - middle)))
     if core <= 0:
         return np.array([max(middle, 0.0), *np.zeros(5)]), np.full(6, np.inf)
+    is_dark = middle > LEAST_MEAN * core
     far = max(growth.max() - middle, 12 * core)
     edges = middle + np.append(np.linspace(-6 * core, 6 * core, CORE_BINS), np.geomspace(6.2 * core, far, TAIL_BINS))
     counts = np.histogram(growth, np.concatenate([[-np.inf], edges, [np.inf]]))[0]
 
     def natural(theta: np.ndarray) -> tuple[float, ...]:
-        if middle <= 0:  # ordinary pixels have no dark current that could differ
+        if not is_dark:  # ordinary pixels have no dark current that could differ
             theta = np.array([0.0, np.log(1e-3), ABSENT, *theta[3:]])
         return _natural(theta, core)
 
@@ -192,7 +194,7 @@ def fitted(growth: np.ndarray, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     rate = max(float(excess.mean()) if len(excess) > 10 else 10 * core, core)
     share = float(np.clip(len(excess) / len(growth), 1e-5, 0.1))
     plain = [middle / core, np.log(0.2), ABSENT, np.log(share / (MOST_HOT - share)), np.log(rate / core), ABSENT]
-    start, of_body = np.array(plain), [SKEW] * (middle > 0)
+    start, of_body = np.array(plain), [SKEW] * is_dark
     of_hot = [HOT_SPREAD] * (len(excess) >= FEWEST_IN_TAIL)
     cool = np.append(start[:FRACTION], [COOL, start[4], ABSENT])
     cool = _likeliest(off, [cool], of_body, (FRACTION, 4))
@@ -270,7 +272,7 @@ def _natural(theta: np.ndarray, core: float) -> tuple[float, ...]:
     skew = 0.0 if np.isnan(theta[SKEW]) else float(np.clip(theta[SKEW], -MOST_SKEW, min(MOST_SKEW, MOST_TAIL / spread)))
     hot_spread = 0.0 if np.isnan(theta[HOT_SPREAD]) else float(np.exp(min(theta[HOT_SPREAD], MOST_HOT_SPREAD)))
     skew = 0.0 if abs(skew) < AS_NORMAL else skew
-    return core * max(float(theta[0]), 1e-3), spread, skew, float(fraction), rate, hot_spread
+    return core * max(float(theta[0]), LEAST_MEAN), spread, skew, float(fraction), rate, hot_spread
 
 
 def _errors(off: Residuals, theta: np.ndarray, held: tuple[int, ...] = ()) -> np.ndarray:
