@@ -79,6 +79,12 @@ def test_the_noise_of_growth_is_told_by_halves_that_differ(still, per_growth):
         assert found.at(at) == pytest.approx(np.sqrt(still**2 + per_growth * at), rel=0.05)
 
 
+def test_halves_that_are_mostly_equal_tell_no_growing_noise():
+    rng = np.random.default_rng(7)
+    halves = np.rint(rng.normal(3.0, 1.0, 40_000)) + (rng.random((2, 40_000)) < 0.1)
+    assert noise_of(halves).per_growth == 0.0
+
+
 @pytest.mark.parametrize(("fraction", "rate"), [(0.0, 1.0), (0.03, 40.0), (0.01, 200.0)])
 def test_noise_that_grows_with_dark_current_is_no_skew(fraction, rate):
     """Broad dark currents of a million pixels had a skew of 0.15, and means 4 % too large, with errors of 0.2 %."""

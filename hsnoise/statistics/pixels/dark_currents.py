@@ -69,7 +69,9 @@ def noise_of(halves: np.ndarray) -> Noise:
         return usual
     x = np.array([np.median(growth[group]) for group in groups])
     variance = np.array([(1.4826 * np.median(apart[group])) ** 2 for group in groups])
-    sigma = np.maximum(variance * np.sqrt(MEDIAN_VARIANCE / np.array([len(group) for group in groups])), 1e-300)
+    if variance.min() <= 0:  # most pixels have the same count in both halves
+        return usual
+    sigma = variance * np.sqrt(MEDIAN_VARIANCE / np.array([len(group) for group in groups]))
     design = np.stack([np.ones_like(x), x], 1) / sigma[:, None]
     covariance = np.linalg.pinv(design.T @ design)
     still, slope = covariance @ design.T @ (variance / sigma)

@@ -72,7 +72,7 @@ def population_of(
     growth = growth[steady].astype(np.float64)
     # A pedestal that falls faster than the dark signal rises is common to all pixels: growth is measured from it.
     fallen = min(float(np.median(growth)), 0.0)
-    of_growth = noise_of(halves[:, steady].astype(np.float64))
+    of_growth = noise_of(halves[:, steady].astype(np.float64) - fallen)
     values, errors = fitted(growth - fallen, of_growth)
     if not _hot_again(halves, limit - pedestal_dn_per_s):
         values[3:], errors[3:] = 0.0, np.inf
