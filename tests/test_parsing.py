@@ -80,6 +80,7 @@ def test_what_is_no_exposure_is_refused(option, text, capsys):
         (["improve", "x", "--max-minutes", "nan"], "--max-minutes: expected minutes above 0, got 'nan'"),
         (["improve", "x", "--max-steps", "-1"], "--max-steps: expected a whole number, 0 or more, got '-1'"),
         (["improve", "x", "--max-steps", "1.5"], "--max-steps: expected a whole number, 0 or more, got '1.5'"),
+        (["enhance", "x", "y.mp4", "--look-ahead", "-1"], "--look-ahead: expected a whole number, 0 or more, got '-1'"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -7,7 +7,8 @@ import pytest
 from scipy.special import gammaln
 
 import hsnoise
-from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf, noise_of
+from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf
+from hsnoise.statistics.pixels.population import noise_of
 
 PLAIN, HEAVY = (30.0, 0.4, 0.0, 0.005, 180.0, 0.0), (20.0, 0.2, 0.0, 0.02, 300.0, 1.2)
 WARM, BOTH = (20.0, 0.15, 1.0, 0.005, 300.0, 0.0), (20.0, 0.15, 1.0, 0.02, 300.0, 0.8)

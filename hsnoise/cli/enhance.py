@@ -47,8 +47,7 @@ def run(args: argparse.Namespace, camera: NoiseModel | None) -> None:
     _check_network(args, net, about, camera)
     light = _of_display(args, net) if camera is None else _of_counts(args, camera, about.get("unit_e"))
     console = Console(stderr=True)
-    how = {"tile": args.tile, "look_ahead": args.look_ahead, "mirrored": args.mirrored}
-    frames = enhance(net, _noted(light, about), **how)
+    frames = enhance(net, _noted(light, about), tile=args.tile, look_ahead=args.look_ahead, mirrored=args.mirrored)
     shown = track(frames, "Enhancing", total=None, console=console, transient=True, disable=not console.is_terminal)
     rate = frame_rate_of(args.video, args.rate)
     sweep(args.out.parent)
@@ -82,8 +81,6 @@ def _check(args: argparse.Namespace) -> None:
         value = getattr(args, option)
         if not low <= value <= high:
             raise ValueError(f"--{option}: expected {low:g} to {high:g}, got {value:g}")
-    if args.look_ahead < 0:
-        raise ValueError(f"--look-ahead: expected 0 or more frames, got {args.look_ahead}")
     for option in ("exposure", "cfa"):
         if args.camera is None and getattr(args, option) is not None:
             raise ValueError(f"--{option}: goes with --camera, the camera of raw frames")

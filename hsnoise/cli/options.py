@@ -282,7 +282,7 @@ def _enhance_arguments(commands: Any) -> None:
     )
     enhance.add_argument(
         "--look-ahead",
-        type=int,
+        type=count,
         default=0,
         metavar="N",
         help="see N following frames of each, too: less noise, in three times the time (default 0; 8 helps a lot)",

@@ -14,6 +14,7 @@ from hsnoise.effects import AbstractEffect
 from hsnoise.frames.joining import replaced
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
+from hsnoise.simulation.gaussian import JITTER, kept_variance
 from hsnoise.simulation.portion import Portion
 from hsnoise.simulation.reference import Reference
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
@@ -186,7 +187,7 @@ def weighted_score(own: Reference, values: np.ndarray, weight: np.ndarray) -> fl
     likelihood methods", Statistica Sinica 21, 2011). How hundreds of statistics scatter together is not known from a
     few dozen draws, and the scatter of that decided before; the weights make up for what they have in common.
     """
-    variance = np.diagonal(own.distribution.covariance)
+    variance = kept_variance(own.own_z()) + JITTER
     densities = -(own.z(values) ** 2) / (2 * variance) - np.log(variance) / 2 - np.log(own.deviation)
     return float(weight @ densities)
 

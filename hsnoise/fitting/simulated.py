@@ -99,7 +99,7 @@ class Draft:
     def finished(self) -> FitResult:
         """The fit, by one step more and with standard errors."""
         y, covariance = self.after_last_step()
-        return _result(self.problem, y, covariance, self.last_step, self.iterations)
+        return _result(self, y, covariance)
 
     def after_last_step(self) -> tuple[np.ndarray, np.ndarray]:
         """y after a step from where the search ended, and its covariance.
@@ -259,7 +259,8 @@ def _not_finite(problem: Problem, y: np.ndarray) -> str:
     return f"statistics of draws are not finite at {', '.join(at)}; fit from another start"
 
 
-def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: float, iterations: int) -> FitResult:
+def _result(draft: Draft, y: np.ndarray, covariance: np.ndarray) -> FitResult:
+    problem = draft.problem
     n, base = len(problem.centre), problem.base
     turn = np.zeros((len(y), len(y)))
     turn[:n, :n] = problem.slope(problem.base_vector(y))[:, None] * problem.whiten
@@ -277,9 +278,9 @@ def _result(problem: Problem, y: np.ndarray, covariance: np.ndarray, last_step: 
         withheld=withheld,
         covariance=not_surer_than(problem.of_base, _in_order(problem, turn @ covariance @ turn.T)),
         method=Method.SYNTHETIC,
-        status=Status.MET if last_step < LONG_STEP else Status.NOT_MET,
-        detail=f"the last step was {last_step:.1g} standard errors long{of_base}",
-        iterations=iterations,
+        status=Status.MET if draft.has_settled else Status.NOT_MET,
+        detail=f"the last step was {draft.last_step:.1g} standard errors long{of_base}",
+        iterations=draft.iterations,
         log_likelihood=float("nan"),
     )
     how = f"{', '.join(problem.extra)}: fitted by simulated statistics (synthetic likelihood), together with all other"

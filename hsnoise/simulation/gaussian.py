@@ -50,6 +50,15 @@ def shrunk(z: np.ndarray, slopes: np.ndarray) -> Gaussian:
     return Gaussian(np.zeros(z.shape[1]), shrunk_covariance(z) + slopes.T @ slopes)
 
 
+def kept_variance(z: np.ndarray) -> np.ndarray:
+    """Variance [statistic] of draws z [draw, statistic], kept from vanishing.
+
+    What hardly varies in the draws is not known to vary so little in captures.
+    """
+    variance = z.var(0)
+    return np.where(variance < HARDLY_VARIES, 1.0, variance)
+
+
 def shrunk_covariance(z: np.ndarray) -> np.ndarray:
     """Covariance [statistic, statistic] of draws z [draw, statistic], shrunk toward its diagonal.
 
@@ -59,9 +68,7 @@ def shrunk_covariance(z: np.ndarray) -> np.ndarray:
     n, d = z.shape
     centred = z - z.mean(0)
     sample = centred.T @ centred / n
-    # Units of z are kept from vanishing: what hardly varies in the draws is not known to vary so little in captures.
-    variance = np.diagonal(sample)
-    sample = sample + np.diag(np.where(variance < HARDLY_VARIES, 1 - variance, 0.0))
+    np.fill_diagonal(sample, kept_variance(z))
     target = np.diag(np.diagonal(sample))
     distance = ((sample - target) ** 2).sum()
     squares = (centred**2).T @ (centred**2) / n - sample**2

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -34,8 +33,6 @@ LOGS = np.linspace(-30.0, 30.0, 601)  # of skewed dark currents, in units of the
 MOST_SKEW, MOST_TAIL = 2.0, 0.45  # of either sign; skew times spread: the variance is infinite from 0.5 on
 LEAST_WEIGHT = 1e-9  # of nodes that count
 AS_NORMAL, LEAST_SKEW = 0.01, 0.1  # below which the logarithm is normal; which counts
-NOISE_RANGE, NOISE_GROUPS, FEWEST_IN_GROUP = (0.02, 0.98), 8, 200  # quantiles of growth at which its noise is measured
-MEDIAN_VARIANCE, SURE_SLOPE = 5.4, 5.0  # relative variance of a squared median deviation, times pixels; standard errors
 WIDE = 0.5  # of the log-normal width: noise above it counts as the wider one
 CORE_BINS, TAIL_BINS = 120, 80
 SIGNIFICANT = 15.0  # twice the rise in log-likelihood above which pixels differ in dark current
@@ -53,31 +50,6 @@ class Noise(NamedTuple):
     def at(self, growth: np.ndarray | float) -> np.ndarray | float:
         """Standard deviation."""
         return np.sqrt(self.still**2 + self.per_growth * np.maximum(growth, 0.0))
-
-
-def noise_of(halves: np.ndarray) -> Noise:
-    """Of the mean growth of two halves of the frames [half, pixel], from how far they are apart, jumps and hits aside.
-
-    The same for all pixels where it does not clearly rise with growth.
-    """
-    growth, apart = halves.mean(0), np.abs(halves[0] - halves[1] - np.median(halves[0] - halves[1])) / 2
-    edges = np.quantile(growth, np.linspace(*NOISE_RANGE, NOISE_GROUPS + 1))
-    groups = [np.flatnonzero((growth >= low) & (growth < high)) for low, high in pairwise(edges)]
-    groups = [group for group in groups if len(group) >= FEWEST_IN_GROUP]
-    usual = Noise(1.4826 * float(np.median(apart)))
-    if len(groups) < 2:
-        return usual
-    x = np.array([np.median(growth[group]) for group in groups])
-    variance = np.array([(1.4826 * np.median(apart[group])) ** 2 for group in groups])
-    if variance.min() <= 0:  # most pixels have the same count in both halves
-        return usual
-    sigma = variance * np.sqrt(MEDIAN_VARIANCE / np.array([len(group) for group in groups]))
-    design = np.stack([np.ones_like(x), x], 1) / sigma[:, None]
-    covariance = np.linalg.pinv(design.T @ design)
-    still, slope = covariance @ design.T @ (variance / sigma)
-    if slope <= SURE_SLOPE * np.sqrt(covariance[1, 1]) or still + slope * max(x.min(), 0.0) <= 0:
-        return usual
-    return Noise(float(np.sqrt(max(still, 0.0))), float(slope))
 
 
 def growth_cdf(

@@ -7,12 +7,13 @@ the frames, which noise does not enter.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
-from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf, noise_of, relative_width
+from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf, relative_width
 from hsnoise.statistics.pixels.sample import of_neighbours
 
 APART_SIGMAS, APART_SHARE = 6.0, 0.3  # if the growth in two halves disagrees by more, it is a hit or a jump
@@ -21,6 +22,8 @@ MOST_COLD = 0.5  # of the number of warm pixels
 WARM_SIGMAS = 6.0  # in units of the noise of the levels, from those below the median
 DARK_SHARE = 0.1  # of the variance over pixels at the shortest exposure
 MANY_ROWS = 48  # whose median tells what a column has
+NOISE_RANGE, NOISE_GROUPS, FEWEST_IN_GROUP = (0.02, 0.98), 8, 200  # quantiles of growth at which its noise is measured
+MEDIAN_VARIANCE, SURE_SLOPE = 5.4, 5.0  # relative variance of a squared median deviation, times pixels; standard errors
 FEWEST_HOT, HOT_AGAIN = 20, 0.5  # pixels; share that must be hot in the other frames as well
 
 
@@ -107,6 +110,31 @@ def population_of(
         quantiles=tuple(float(q) for q in np.quantile(growth, (0.01, 0.16, 0.84, 0.99, 0.999))),
         noise=float(noise),
     )
+
+
+def noise_of(halves: np.ndarray) -> Noise:
+    """Of the mean growth of two halves of the frames [half, pixel], from how far they are apart, jumps and hits aside.
+
+    The same for all pixels where it does not clearly rise with growth.
+    """
+    growth = halves.mean(0)
+    edges = np.quantile(growth, np.linspace(*NOISE_RANGE, NOISE_GROUPS + 1))
+    groups = [np.flatnonzero((growth >= low) & (growth < high)) for low, high in pairwise(edges)]
+    groups = [group for group in groups if len(group) >= FEWEST_IN_GROUP]
+    usual = Noise(growth_noise(halves) / np.sqrt(2))
+    if len(groups) < 2:
+        return usual
+    x = np.array([np.median(growth[group]) for group in groups])
+    variance = np.array([growth_noise(halves[:, group]) ** 2 / 2 for group in groups])
+    if variance.min() <= 0:  # most pixels have the same count in both halves
+        return usual
+    sigma = variance * np.sqrt(MEDIAN_VARIANCE / np.array([len(group) for group in groups]))
+    design = np.stack([np.ones_like(x), x], 1) / sigma[:, None]
+    covariance = np.linalg.pinv(design.T @ design)
+    still, slope = covariance @ design.T @ (variance / sigma)
+    if slope <= SURE_SLOPE * np.sqrt(covariance[1, 1]) or still + slope * max(x.min(), 0.0) <= 0:
+        return usual
+    return Noise(float(np.sqrt(max(still, 0.0))), float(slope))
 
 
 class Patterns(NamedTuple):
