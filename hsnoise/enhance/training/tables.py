@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +19,7 @@ from hsnoise.enhance.training.scenes import Scene
 from hsnoise.enhance.training.validation import psnr_db
 
 REFER, OURS, SCALED = "scaled input", "hsnoise ST-LSTM", "hsnoise ST-LSTM, scaled"
-AT_BEST = "hsnoise ST-LSTM, both ways, mirrored, scaled"  # with the frames that follow
+AT_BEST = "hsnoise at its best, scaled"  # with the frames that follow, and mirrored ones
 OF_HSNOISE = (OURS, SCALED, AT_BEST)
 FORMS = {"psnr_db": ".2f", "ssim": ".3f"}
 SHOWN_FRAMES = (1, 2, 3, 5, 8, 12, 16, 20)
@@ -151,7 +152,7 @@ def draw_curves(records: Sequence[dict], filling: dict[str, list[float]], in_wor
     against_light, against_frame, memory = figure.subplots(1, 3)
     lights, longest = lights_in(records), of_longest(records)
     frames = sorted({record["frame"] for record in longest})
-    for method, marker in zip(methods_in(records), "so*vDXP", strict=False):
+    for method, marker in zip(methods_in(records), cycle("so*vDXP^"), strict=False):
         style = {"label": method, "alpha": 0.8, "lw": 2.5 if method in OF_HSNOISE else 1.2}
         of = [list(of_clips(records, "psnr_db", method=method, mean_e=light).values()) for light in lights]
         errors = [standard_error(values) for values in of]
