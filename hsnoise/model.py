@@ -7,7 +7,7 @@ import importlib.metadata
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
@@ -292,23 +292,26 @@ def sample_dark(
 
 
 def sample_by_effect(
-    key: RandomKey,
-    clean: ArrayLike,
+    keys: RandomKey,
+    light: np.ndarray,
+    n_frames: int,
     params: NoiseModel,
     *,
-    exposure_s: float | Scalar,
+    exposures_s: Sequence[float],
     sensor_key: RandomKey,
     window: Window | None = None,
     shared: Shared | None = None,
 ) -> Array:
-    """As `sample` for [frame, row, column], the same counts up to rounding, but each effect is compiled separately.
+    """Exposures of one sensor, each as `sample` draws it, up to rounding, but with each effect compiled separately.
 
-    It runs somewhat slower, but after adding an effect to a model, only that effect is compiled.
-    window: as in FrameStack, where the frames lie on a larger sensor; shared: what draws of other models may have in
-    common with this one.
+    After adding an effect to a model, only that effect is compiled. What exposures have in common is drawn once.
+    keys: one for each exposure; light: expected photoelectrons of all its frames [exposure, row, column]; window: as in
+    FrameStack, where the frames lie on a larger sensor; shared: what draws of other models may have in common with
+    these. Returns counts [exposure, frame, row, column].
     """
-    key, light, shape, effects, capture = _prepared(key, clean, params, exposure_s, sensor_key, window)
-    return apply_by_effect(key, light, shape, effects, capture, shared)
+    exposures = np.array([checked_exposure(exposure_s) for exposure_s in exposures_s], float)
+    shape = (n_frames, *light.shape[1:])
+    return apply_by_effect(keys, *_on_sensor(light, shape, params, exposures, sensor_key, window), shared, quick=True)
 
 
 def dark_signals(
@@ -316,7 +319,7 @@ def dark_signals(
 ) -> Iterator[tuple[AbstractEffect, Array]]:
     """The signal after each effect in turn when `sample_by_effect` draws darks, [frame, row, column]."""
     clean = np.broadcast_to(np.float32(0), (n_frames, *shape))
-    return signals(*_prepared(key, clean, params, exposure_s, None))
+    return signals(*_prepared(key, clean, params, exposure_s, None), quick=True)
 
 
 def in_session_precision(params: NoiseModel) -> NoiseModel:
@@ -330,21 +333,28 @@ def in_session_precision(params: NoiseModel) -> NoiseModel:
     return jax.tree.map(converted, params)
 
 
-def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
+def _prepared(key, clean, params, exposure_s, sensor_key):
     """Checked input: key, photoelectrons [frame, row, column] or one number for all, shape, effects, capture."""
     if not isinstance(params, NoiseModel):
         raise TypeError(f"params: expected a NoiseModel (fit.params of a fit), got {type(params).__name__}.")
     check_not_forked()
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else key_of("sensor_key", sensor_key)
+    clean, *_ = checked_light(clean, params.cfa)
+    exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
+    shape = (math.prod(clean.shape[:-2]), *clean.shape[-2:])
+    return key, *_on_sensor(clean, shape, params, exposure, sensor_key)
+
+
+def _on_sensor(clean, shape, params, exposure_s, sensor_key, window=None) -> tuple[Array, tuple, tuple, Capture]:
+    """Light, shape, effects and capture of an exposure, or of several [exposure], with frames of `shape`."""
     dtype = jnp.result_type(float)
     clean, low, high = checked_light(clean, params.cfa)
-    exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
     params = in_session_precision(params)
-    effects = merged(params.effects, _regime(low, high, params, exposure))
+    effects = merged(params.effects, _regime(low, high, params, exposure_s))
     capture = Capture(
-        jnp.asarray(exposure, dtype),
-        clean.shape[-2:],
+        jnp.asarray(exposure_s, dtype),
+        shape[1:],
         params.cfa,
         params.shutter,
         sensor_key,
@@ -353,9 +363,9 @@ def _prepared(key, clean, params, exposure_s, sensor_key, window=None):
         read_noise=params["read_noise"].sigma if "read_noise" in params else None,
         window=window,
     )
-    shape = (math.prod(clean.shape[:-2]), *capture.shape)
-    light = jnp.asarray(low, dtype) if low == high else jnp.asarray(clean, dtype).reshape(shape)
-    return key, light, shape, effects, capture
+    of_frames = (*np.shape(exposure_s), -1, *shape[1:])
+    light = jnp.asarray(low, dtype) if low == high else jnp.asarray(clean, dtype).reshape(of_frames)
+    return light, shape, effects, capture
 
 
 def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
@@ -365,8 +375,7 @@ def _regime(low: float, high: float, params: NoiseModel, exposure_s) -> Regime:
     changed = any(effect.acts_at < Stage.PHOTONS or any(may_scale(s, effect) for s in scales) for effect in params)
     if np.isnan(low) or changed or is_traced(rate) or is_traced(exposure_s):
         return "any"
-    dark = float(rate) * float(exposure_s)
-    return regime_of(low + dark, high + dark)
+    return regime_of(low + float(rate) * float(np.min(exposure_s)), high + float(rate) * float(np.max(exposure_s)))
 
 
 def _fit_to_channels(effect: AbstractEffect, channels: tuple[str, ...]) -> AbstractEffect:

@@ -63,7 +63,7 @@ def test_effects_in_one_program_draw_what_each_draws(light):
     model = model.add(DarkCurrentNonuniformity(0.4))
     clean = jnp.full((3, 32, 48), light)
     whole = sample(KEY, clean, model, exposure_s=0.05, sensor_key=1)
-    one_by_one = sample_by_effect(KEY, clean, model, exposure_s=0.05, sensor_key=jax.random.key(1))
+    one_by_one = sample_by_effect(KEY[None], clean[:1], 3, model, exposures_s=[0.05], sensor_key=jax.random.key(1))[0]
     off = np.abs(np.asarray(whole, int) - np.asarray(one_by_one, int))
     assert off.max() <= 1 and np.mean(off > 0) < 1e-3  # where rounding decides
 

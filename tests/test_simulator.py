@@ -19,7 +19,7 @@ from hsnoise.frames.lazy import LazyFrames
 from hsnoise.frames.stack import FrameStack
 from hsnoise.simulation import portion as cutting
 from hsnoise.simulation import simulator as drawing
-from hsnoise.simulation.draws import _alike, _without_spikes, draw_capture
+from hsnoise.simulation.draws import _alike, _together, _without_spikes, draw_capture
 from hsnoise.simulation.portion import LEAST_COLUMNS, LEAST_FRAMES, Portion
 from hsnoise.simulation.simulator import Purpose, Simulator, key_for
 from hsnoise.statistics.structure import Structure
@@ -132,6 +132,23 @@ def test_what_tunes_draws_nothing_that_judges(few_candidates, monkeypatch):
 )
 def test_exposures_of_almost_as_many_frames_share_programs(needed, drawn):
     assert _alike(needed) == drawn
+
+
+@pytest.mark.parametrize(
+    ("frames", "kinds", "pixels", "together"),
+    [
+        ([2, 2, 2], "ddd", 600, [(2, [0, 1, 2])]),
+        ([2, 2, 2, 2, 2], "ddddd", 400, [(2, [0, 1]), (2, [2, 3]), (2, [4, 4])]),
+        ([2, 2, 2, 2, 2, 2, 2], "dffffdd", 800, [(2, [0, 5, 6, 6]), (2, [1, 2, 3, 4])]),
+        ([8, 2, 2], "dff", 10, [(8, [0]), (2, [1]), (2, [2])]),
+    ],
+)
+def test_exposures_are_drawn_together_where_they_are_alike(monkeypatch, frames, kinds, pixels, together):
+    monkeypatch.setattr("hsnoise.simulation.draws.TOGETHER", pixels)
+    of = {"d": "dark", "f": "flat"}
+    counts = [np.arange(100 * n, dtype=np.uint16).reshape(n, 10, 10) for n in frames]
+    like = FrameStack(counts, [1.0 + e for e in range(len(frames))], kind=[of[kind] for kind in kinds])
+    assert list(_together(frames, like)) == together
 
 
 def test_frames_that_are_drawn_to_share_programs_are_left_out():

@@ -1,4 +1,4 @@
-"""Compiling large programs that run often."""
+"""Compiling large programs that run often, and small ones that hardly do."""
 
 from __future__ import annotations
 
@@ -21,6 +21,21 @@ def jit_lean(function: Callable) -> Callable:
     def compiled():  # at the first call, not on import: asking for the options starts a backend
         jit: Any = eqx.filter_jit  # its type does not mention compiler_options
         return jit(function, compiler_options=lean_options())
+
+    return wraps(function)(lambda *arguments: compiled()(*arguments))
+
+
+def jit_quick(function: Callable, static_argnums: tuple[int, ...]) -> Callable:
+    """`jax.jit` for programs that run some dozen times: on CPUs they compile in a third of the time, and run as fast
+    or a tenth slower. They cannot be part of another program, as those of `jit_lean`.
+    """
+
+    @cache
+    def compiled():
+        options: Any = {}
+        if jax.default_backend() == "cpu" and lean_options():
+            options = {**lean_options(), "xla_backend_optimization_level": 1, "xla_cpu_parallel_codegen_split_count": 1}
+        return jax.jit(function, static_argnums=static_argnums, compiler_options=options)
 
     return wraps(function)(lambda *arguments: compiled()(*arguments))
 

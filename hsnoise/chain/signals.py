@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.compiling import jit_quick
 from hsnoise._core.keys import named_key
 from hsnoise._core.types import NotDeclared
 from hsnoise.chain.arrivals import Arrivals
@@ -19,27 +20,32 @@ from hsnoise.effects import AbstractEffect, Stage
 SCALES = ("read_noise_scale", "dark_current_scale")  # the ways in which an effect scales what another draws
 
 
-def apply_by_effect(key, light, shape, effects, capture, shared=None):
-    """The signal after the last effect, [frame, row, column]; each effect is compiled separately."""
-    steps = signals(key, light, shape, effects, capture, shared)
-    return reduce(lambda _, step: step[1], steps, jnp.broadcast_to(light, shape))
+def apply_by_effect(key, light, shape, effects, capture, shared=None, *, quick=False):
+    """The signal after the last effect, [frame, row, column]; each effect is compiled separately. See `signals`."""
+    steps = signals(key, light, shape, effects, capture, shared, quick=quick)
+    return reduce(lambda _, step: step[1], steps, jnp.broadcast_to(light, _whole(capture, shape)))
 
 
-def signals(key, light, shape, effects, capture, shared: Shared | None = None):
+def signals(key, light, shape, effects, capture, shared: Shared | None = None, *, quick=False):
     """Each effect in turn with the signal after it, where `light` (e-, of `shape` or a scalar) falls on the sensor.
 
-    shared: what other draws may have in common with this one. Raises ValueError, naming the effect, if an effect does
-    not return a signal of this shape.
+    Several exposures are drawn together if `capture.exposure_s` is [exposure]: their keys, light and signals have this
+    axis first (a scalar stands for all), and each is as it would be alone. What they have in common is drawn once.
+    shared: what other draws may have in common with this one; quick: whether effects are compiled quickly, which is
+    impossible inside another program. Raises ValueError, naming the effect, if an effect does not return a signal of
+    this shape.
     """
+    factor, sample_one = QUICK if quick else THOROUGH
+    whole = _whole(capture, shape)
     once = _Anew() if shared is None else _Once(shared, (identity((key, light, capture)), shape))
-    scales = {what: _scale_of(what, key, effects, capture, shape, once) for what in SCALES}
-    of_light = _scale_of("light_scale", key, effects, capture, shape, once)
+    scales = {what: _scale_of(what, key, effects, capture, shape, once, factor) for what in SCALES}
+    of_light = _scale_of("light_scale", key, effects, capture, shape, once, factor)
     capture = dataclasses.replace(capture, **scales)
-    signal = light if of_light is None else jnp.broadcast_to(light, shape) * of_light
+    signal = light if of_light is None else jnp.broadcast_to(light, whole) * of_light
     seen = {scales: _seen_with(capture, scales) for scales in {effect.scaled_by for effect in effects}}
     for effect in effects:
         try:
-            drawn = once.after(effect, partial(_sample_one, key, signal, shape, effect, seen[effect.scaled_by]))
+            drawn = once.after(effect, partial(sample_one, key, signal, shape, effect, seen[effect.scaled_by]))
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise TypeError(
                 f"{effect.name}: JAX cannot compile its sample; use jax.numpy instead of numpy, jnp.where instead of if"
@@ -51,8 +57,8 @@ def signals(key, light, shape, effects, capture, shared: Shared | None = None):
             raise ValueError(f"{effect.name}: its sample returned None, expected the signal; is a return missing?")
         if not isinstance(drawn, jax.Array):
             raise ValueError(f"{effect.name}: its sample returned a {type(drawn).__name__}, expected one array.")
-        if np.shape(drawn) != shape:
-            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {shape}.")
+        if np.shape(drawn) != whole:
+            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {whole}.")
         if jnp.iscomplexobj(drawn):
             raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
         if jnp.issubdtype(drawn.dtype, jnp.integer) and effect.acts_at < Stage.DIGITAL:
@@ -120,10 +126,10 @@ class _Once:
         return self.shared.get(self.trail, draw)
 
 
-def _scale_of(what, key, effects, capture, shape, once):
+def _scale_of(what, key, effects, capture, shape, once, factor):
     """Product of all effects' factors on the read noise or dark current of each pixel; None: 1."""
     factors = [
-        once.factor(what, effect, partial(_factor, what, key, effect, capture, shape))
+        once.factor(what, effect, partial(factor, what, key, effect, capture, shape))
         for effect in effects
         if may_scale(what, effect)
     ]
@@ -131,14 +137,41 @@ def _scale_of(what, key, effects, capture, shape, once):
     return reduce(jnp.multiply, factors) if factors else None
 
 
-@partial(jax.jit, static_argnums=(0, 4))
 def _factor(what, key, effect, capture, shape):
-    return getattr(effect, what)(capture, shape, key=named_key(key, effect.name))
+    def draw(key, _, capture):
+        return getattr(effect, what)(capture, shape, key=named_key(key, effect.name))
+
+    return _each(draw, key, None, capture)
 
 
-@partial(jax.jit, static_argnums=2)
 def _sample_one(key, signal, shape, effect, capture):
-    own = named_key(key, effect.stream or effect.name)
-    if isinstance(effect, Arrivals):
-        return effect.expose(signal, shape, capture, key=own)
-    return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)
+    def draw(key, signal, capture):
+        own = named_key(key, effect.stream or effect.name)
+        if isinstance(effect, Arrivals):
+            return effect.expose(signal, shape, capture, key=own)
+        return effect.sample(jnp.broadcast_to(signal, shape), capture, key=own)
+
+    return _each(draw, key, signal, capture)
+
+
+FORMS = ((_factor, (0, 4)), (_sample_one, (2,)))
+THOROUGH = tuple(jax.jit(form, static_argnums=static) for form, static in FORMS)
+QUICK = tuple(jit_quick(form, static) for form, static in FORMS)
+
+
+def _each(draw, key, signal, capture):
+    """What `draw` makes of the capture's only exposure, or of each."""
+    if np.ndim(capture.exposure_s) == 0:
+        return draw(key, signal, capture)
+    scales = {what: getattr(capture, what) for what in SCALES}
+    own = {what: scale for what, scale in scales.items() if isinstance(scale, jax.Array)}
+
+    def one(key, signal, exposure_s, own):
+        return draw(key, signal, dataclasses.replace(capture, exposure_s=exposure_s, **own))
+
+    return jax.vmap(one, (0, 0 if np.ndim(signal) else None, 0, 0))(key, signal, capture.exposure_s, own)
+
+
+def _whole(capture, shape):
+    """Shape of the signals of all exposures of a capture whose frames have `shape` each."""
+    return (*np.shape(capture.exposure_s), *shape)

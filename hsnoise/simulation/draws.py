@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import jax
@@ -22,7 +22,8 @@ MOST_RANGES = 100.0  # a signal this many times what the camera can hold is in a
 SURFACE_DEGREE = 3  # of the light on flats
 SPIKE, LEAST_DN = 8.0, 0.5  # deviations of a pixel from the median of those around it; the least of these
 SMOOTH_PIXELS = 3.0  # of the light on flats: a pixel has 1 % of a say in its own
-SPARE_FRAMES = 0.3  # of those that are drawn, for exposures of almost as many frames to share compiled programs
+TOGETHER = 800_000  # pixels that are drawn in one go: more leave the processor's cache, fewer wait for Python
+SPARE = 0.3  # of those that are drawn, for exposures of almost as many frames to share compiled programs
 
 
 def check_fits(model: NoiseModel, stack: FrameStack | Summary, name: str = "params") -> None:
@@ -85,34 +86,51 @@ def draw_capture(
     `like`; default: none; shared: what draws of other models may have in common with this one.
     """
     key = key_of("key", key)
-    sensor_key = named_key(key, "sensor")
+    sensor_key, of_frames = named_key(key, "sensor"), named_key(key, "frames")
     firsts = before or [0] * like.n_exposures
     needed = [first + frames for first, frames in zip(firsts, like.n_frames, strict=True)]
     sampled = in_session_precision(model)  # once for all exposures
-    counts = []
-    for e, (exposure_s, frames) in enumerate(zip(like.exposure_s, _alike(needed), strict=True)):
-        own = jax.random.fold_in(named_key(key, "frames"), e)
-        clean = np.broadcast_to(light_of(model, like, e), (frames, *like.shape))
+    counts: dict[int, np.ndarray] = {}
+    for frames, some in _together(_alike(needed), like):
         drawn = sample_by_effect(
-            own,
-            clean,
+            jax.vmap(jax.random.fold_in, (None, 0))(of_frames, np.array(some)),
+            np.stack([light_of(model, like, e) for e in some]),
+            frames,
             sampled,
-            exposure_s=float(exposure_s),
+            exposures_s=[float(like.exposure_s[e]) for e in some],
             sensor_key=sensor_key,
             window=like.window,
             shared=shared,
         )
-        counts.append(np.asarray(drawn)[firsts[e] : needed[e]])
-    return like.with_counts(counts, like.window)
+        counts.update((e, of[firsts[e] : needed[e]]) for e, of in zip(some, np.asarray(drawn), strict=True))
+    return like.with_counts([counts[e] for e in range(like.n_exposures)], like.window)
+
+
+def _together(numbers: Sequence[int], like: FrameStack) -> Iterator[tuple[int, list[int]]]:
+    """Numbers of frames, and exposures of which so many are drawn together: all darks or all flats, TOGETHER pixels.
+
+    For them to share compiled programs, some may come twice.
+    """
+    for frames in dict.fromkeys(numbers):
+        most = max(TOGETHER // (frames * like.shape[0] * like.shape[1]), 1)
+        groups: dict[str, list[int]] = {}
+        for e, kind in enumerate(like.kind):
+            if numbers[e] == frames:
+                groups.setdefault(kind, []).append(e)
+        sizes = _alike([-(-len(group) // -(-len(group) // most)) for group in groups.values()])
+        for group, size in zip(groups.values(), sizes, strict=True):
+            for first in range(0, len(group), size):
+                some = group[first : first + size]
+                yield frames, some + some[-1:] * (size - len(some))
 
 
 def _alike(numbers: Sequence[int]) -> list[int]:
-    """Numbers of frames to draw for those that are needed: compiling an effect for one more takes as long as drawing
-    many frames.
+    """Numbers (of frames, of exposures) to draw for those that are needed: compiling an effect for one more takes as
+    long as drawing many frames.
     """
     kept: list[int] = []
     for number in sorted(set(numbers), reverse=True):
-        if not kept or number < (1 - SPARE_FRAMES) * kept[-1]:
+        if not kept or number < (1 - SPARE) * kept[-1]:
             kept.append(number)
     return [min(size for size in kept if size >= number) for number in numbers]
 

@@ -71,7 +71,7 @@ from hsnoise.effects import (
     TapGains,
     TapOffsets,
 )
-from hsnoise.model import NoiseModel, sample
+from hsnoise.model import NoiseModel, sample, sample_by_effect
 
 KEY = jax.random.key(7)
 SHAPE = (2, 4, 6)
@@ -337,6 +337,16 @@ def test_vmap_is_a_loop(effect, single_precision):
         alone = sample(key, signal(), scaled(model_of(effect), scale), exposure_s=0.1 * scale)
         # Programs that are compiled apart contract products and sums differently: another last bit.
         np.testing.assert_allclose(one, alone, rtol=1e-6)
+
+
+@each_effect
+def test_exposures_drawn_together_are_each_as_alone(effect, single_precision):
+    keys, exposures_s, light = jax.random.split(KEY, 2), (0.1, 0.3), signal()
+    drawn = sample_by_effect(keys, light, 3, model_of(effect), exposures_s=exposures_s, sensor_key=KEY)
+    for key, exposure_s, lit, one in zip(keys, exposures_s, light, drawn, strict=True):
+        clean = np.broadcast_to(lit, (3, *SHAPE[1:]))
+        alone = sample(key, clean, model_of(effect), exposure_s=exposure_s, sensor_key=KEY)
+        np.testing.assert_allclose(one, alone, rtol=1e-5, atol=1e-5 * np.abs(alone).max())
 
 
 @each_effect

@@ -109,7 +109,8 @@ def test_light_falls_on_each_pixel_by_its_response_and_dark_current_does_not():
     model = NoiseModel(effects, cfa="mono", shutter="global", exposure_s=1.0)
     expected = 100 * response + 20
     lit = np.full((400, 16, 16), 100.0)
-    for drawn in (sample(KEY, lit, model), sample_by_effect(KEY, lit, model, exposure_s=1.0, sensor_key=KEY)):
+    (by_effect,) = sample_by_effect(KEY[None], lit[:1], 400, model, exposures_s=[1.0], sensor_key=KEY)
+    for drawn in (sample(KEY, lit, model), by_effect):
         drawn = np.asarray(drawn)
         assert np.abs((drawn.mean(0) - expected) / np.sqrt((expected + 1) / 400)).max() < SIGMAS
         np.testing.assert_allclose(drawn.var(0).mean(), expected.mean() + 1, rtol=0.02)

@@ -65,21 +65,17 @@ def _without_outputs(model: NoiseModel) -> NoiseModel:
 def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Survey:
     """A survey of darks drawn from the model, all of one size so that a process compiles the sampling once."""
     key = jax.random.key(0)
-    clean = np.broadcast_to(np.float32(0), (FRAMES, *SHAPE))
-    window = _middle(stack)
-    counts = [
-        sample_by_effect(
-            jax.random.fold_in(named_key(key, "frames"), e),
-            clean,
-            model,
-            exposure_s=exposure_s,
-            sensor_key=named_key(key, "sensor"),
-            window=window,
-        )
-        for e, exposure_s in enumerate(exposures_s)
-    ]
+    counts = sample_by_effect(
+        jax.vmap(jax.random.fold_in, (None, 0))(named_key(key, "frames"), np.arange(len(exposures_s))),
+        np.broadcast_to(np.float32(0), (len(exposures_s), *SHAPE)),
+        FRAMES,
+        model,
+        exposures_s=exposures_s,
+        sensor_key=named_key(key, "sensor"),
+        window=_middle(stack),
+    )
     taken = {"cfa": stack.cfa, "shutter": stack.shutter, "white_level": stack.white_level}
-    return survey(FrameStack([np.asarray(of) for of in counts], exposure_s=exposures_s, **taken))
+    return survey(FrameStack(list(np.asarray(counts)), exposure_s=exposures_s, **taken))
 
 
 def _of_the_middle(stack: FrameStack, found: Survey) -> Survey:
