@@ -58,3 +58,9 @@ def named_key(key: RandomKey, name: str) -> RandomKey:
     The hash is CRC-32 of the UTF-8 name: unlike Python's `hash`, it is the same in every process.
     """
     return jax.random.fold_in(key, np.uint32(zlib.crc32(name.encode())))
+
+
+@jax.jit
+def numbered_keys(key: RandomKey, numbers: np.ndarray) -> RandomKey:
+    """A key for each of `numbers`, derived from `key` as by `jax.random.fold_in`."""
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)

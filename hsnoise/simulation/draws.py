@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import scipy  # its parts are imported when they are used
 
-from hsnoise._core.keys import key_of, named_key
+from hsnoise._core.keys import key_of, named_key, numbered_keys
 from hsnoise._core.naming import named, setting
 from hsnoise._core.types import RandomKey, cfa_tile, channel_index
 from hsnoise.chain.shared import Shared
@@ -93,8 +93,8 @@ def draw_capture(
     counts: dict[int, np.ndarray] = {}
     for frames, some in _together(_alike(needed), like):
         drawn = sample_by_effect(
-            jax.vmap(jax.random.fold_in, (None, 0))(of_frames, np.array(some)),
-            np.stack([light_of(model, like, e) for e in some]),
+            numbered_keys(of_frames, np.array(some)),
+            _light_of_all(model, like, some),
             frames,
             sampled,
             exposures_s=[float(like.exposure_s[e]) for e in some],
@@ -133,6 +133,13 @@ def _alike(numbers: Sequence[int]) -> list[int]:
         if not kept or number < (1 - SPARE) * kept[-1]:
             kept.append(number)
     return [min(size for size in kept if size >= number) for number in numbers]
+
+
+def _light_of_all(model: NoiseModel, like: FrameStack, exposures: list[int]) -> np.ndarray:
+    """Light of exposures that are all darks or all flats [exposure, row, column]."""
+    if like.kind[exposures[0]] == "dark":
+        return np.broadcast_to(np.float32(0), (len(exposures), *like.shape))
+    return np.stack([light_of(model, like, e) for e in exposures])
 
 
 def light_of(model: NoiseModel, like: FrameStack, exposure: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from hsnoise._core.keys import named_key
+from hsnoise._core.keys import named_key, numbered_keys
 from hsnoise._core.types import seconds
 from hsnoise.fitting.result import FitResult
 from hsnoise.frames.stack import FrameStack
@@ -66,7 +66,7 @@ def _drawn(model: NoiseModel, stack: FrameStack, exposures_s: list[float]) -> Su
     """A survey of darks drawn from the model, all of one size so that a process compiles the sampling once."""
     key = jax.random.key(0)
     counts = sample_by_effect(
-        jax.vmap(jax.random.fold_in, (None, 0))(named_key(key, "frames"), np.arange(len(exposures_s))),
+        numbered_keys(named_key(key, "frames"), np.arange(len(exposures_s))),
         np.broadcast_to(np.float32(0), (len(exposures_s), *SHAPE)),
         FRAMES,
         model,
