@@ -52,6 +52,11 @@ MODEST = {
     "read_noise_nonuniformity": 0.35,
     "correlated_read_noise": 0.2,  # of the variance
     "periodic_banding": 0.8,  # e-
+    "interference": 0.4,  # e-
+    "row_bank_noise": 1.0,  # e-, rms of a bank's rows
+    "row_group_noise": 0.8,  # e-
+    "frame_tilt": 1.5,  # e-, from the first row to the last, rms over frames
+    "frame_settling": 1.5,  # e-, in the first frame
     "crosstalk": 0.02,
     "readout_bandwidth": 0.05,
     "readout_overshoot": 0.04,
@@ -61,6 +66,7 @@ MODEST = {
     "tap_gains": 0.06,  # relative
     "black_shading": 1.5,  # DN, rms
     "missing_codes": 0.6,  # digital gain minus 1
+    "adc_nonuniformity": 0.06,  # DN, rms error of the width of a code
     "cosmic_rays": 60.0,  # hits per Mpixel and frame
     "shared_row_gain": 0.12,
     "black_clamp": 0.7,  # of the dark level
@@ -197,8 +203,17 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
         out["read"] = spread / np.sqrt((spread**2).mean())
     elif effect == "correlated_read_noise":
         out["memory"], out["alternates"] = float(rng.uniform(0.3, 0.8)), bool(rng.integers(2))
-    elif effect == "periodic_banding":
+    elif effect in ("periodic_banding", "interference"):
         out["frequency"] = float(rng.uniform(0.03, 0.45))
+        out["across"] = float(rng.uniform(-0.45, 0.45))
+    elif effect == "row_group_noise":
+        together = int(rng.choice([4, 8, 16]))
+        out["group"] = (np.arange(rows) + rng.integers(together)) // together
+    elif effect == "frame_settling":
+        out["frames"] = float(rng.uniform(0.7, 3.0))
+    elif effect == "adc_nonuniformity":
+        widths = 1 + size * rng.standard_normal(int(rng.choice([4, 8, 16])))
+        out["widths"] = widths / widths.mean()
     elif effect == "block_offsets":
         out["offset"] = 0.8 * size * rng.standard_normal((rows // 64 + 1, columns // 64 + 1))[r // 64, c // 64]
     elif effect == "read_noise_along_row":
@@ -289,6 +304,20 @@ def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float
     if effect == "periodic_banding":
         phase = rng.uniform(0, 2 * np.pi, (frames, 1, 1))
         return size * np.sin(2 * np.pi * hidden["frequency"] * np.arange(rows)[None, :, None] + phase)
+    if effect == "interference":
+        turns = hidden["frequency"] * np.arange(rows)[:, None] + hidden["across"] * np.arange(columns)
+        return size * np.sin(2 * np.pi * (turns + rng.random((frames, 1, 1))))
+    if effect == "row_bank_noise":
+        kicks = rng.standard_normal((2, frames, rows // 2)) * np.sqrt(1 - 0.9**2)
+        kicks[..., 0] /= np.sqrt(1 - 0.9**2)
+        banks = lfilter([1.0], [1.0, -0.9], kicks, axis=-1)
+        return size * banks.transpose(1, 2, 0).reshape(frames, rows, 1)
+    if effect == "row_group_noise":
+        return size * rng.standard_normal((frames, rows))[:, hidden["group"], None]
+    if effect == "frame_tilt":
+        return size * rng.standard_normal((frames, 1, 1)) * np.linspace(-0.5, 0.5, rows)[:, None]
+    if effect == "frame_settling":
+        return size * np.exp(-np.arange(frames) / hidden["frames"])[:, None, None]
     if effect == "random_telegraph_noise":
         return 12.0 * hidden["jumping"] * (rng.random((frames, *shape)) < hidden["duty"])
     if effect == "row_memory":
@@ -314,7 +343,11 @@ def _digital(camera: Camera, sizes, x: np.ndarray, hidden, t: float, rng) -> np.
         beta = np.maximum(beta, 0) * np.maximum(1 + shared, 0)
         clamped = sizes.get("black_clamp", 0.0) * camera.gain[c] * camera.dark * t
         y = np.where(colour == c, camera.gain[c] * beta[:, :, None] * x - clamped, y)
-    counts = np.clip(np.rint(y + camera.black + hidden.get("black", 0.0)), 0, 65535)
+    y += camera.black + hidden.get("black", 0.0)
+    counts = np.clip(np.rint(y), 0, 65535)
+    if "widths" in hidden:
+        ends = np.cumsum(np.resize(hidden["widths"], int(counts.max()) + 2)) - 0.5
+        counts = np.searchsorted(ends, y, side="right").astype(float)
     if "row" in hidden:  # the readout has lost step for a fifth of the rows
         swapped = slice(hidden["row"], hidden["row"] + 2 * (rows // 10))
         pairs = counts[:, swapped].reshape(frames, -1, 2, columns)
