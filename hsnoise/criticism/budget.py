@@ -10,6 +10,7 @@ import numpy as np
 
 from hsnoise._core.arguments import callback
 from hsnoise._core.data_frames import data_frame
+from hsnoise._core.robust import robust_sigma
 from hsnoise.criticism.budget_table import as_html, printed
 from hsnoise.frames.source import as_stack
 from hsnoise.frames.stack import FrameStack
@@ -244,7 +245,7 @@ def _spread(values: np.ndarray, unit: str) -> PixelSpread:
     """Of values in two halves of the frames [half, pixel]: what both share is free of the noise of estimation."""
     mean = values.mean(0, dtype=np.float64)
     median = float(np.median(mean))
-    width = 5 * 1.4826 * float(np.median(np.abs(mean - median))) + 1e-12
+    width = 5 * robust_sigma(mean - median) + 1e-12
     a, b = np.clip(values.astype(np.float64), median - width, median + width)
     covariance = covariance_of(a, b)
     few = min(max(FEWEST_TOP, int(TOP_SHARE * len(mean))), len(mean))

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from hsnoise._core.coloured import EXPONENTS, exponent_of, fading_power
+from hsnoise._core.robust import robust_sigma
 from hsnoise.fitting.pixel_rows import LEAST_ERROR, widened
 from hsnoise.statistics.pixels.shading import FAR, Shading
 from hsnoise.statistics.pixels.survey import Plane
@@ -146,4 +147,4 @@ def _noise_dn2(plane: Plane, axis: str, frames: int) -> float:
 
 def _typical_dn(values: np.ndarray) -> float:
     """Standard deviation of normal values with the same median deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return robust_sigma(values - np.median(values))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from hsnoise._core.robust import OF_MEDIAN, robust_sigma
 from hsnoise.fitting.pixel_flats import between, saturates, weighted_mean
 from hsnoise.statistics.pixels.population import FEWEST_HOT, WARM_SIGMAS, Warm, beyond_neighbours, warm_of
 from hsnoise.statistics.pixels.survey import Group, Survey
-
-OF_MEDIAN = 1.2533  # standard error of a median over that of a mean, of normal values
 
 
 def warm_in(found: Survey, c: int) -> Warm | None:
@@ -29,7 +28,7 @@ def _growth(found: Survey, c: int, darks_s: float, off: np.ndarray, columns: int
     a flat shows warm pixels as a dark of its exposure would. Pixels are chosen in one half of the darks and measured in
     the other, as the largest levels are too large by chance. Infinite error: flats do not tell.
     """
-    chosen = off[0] > WARM_SIGMAS * 1.4826 * np.median(np.abs(off[0] - np.median(off[0])))
+    chosen = off[0] > WARM_SIGMAS * robust_sigma(off[0] - np.median(off[0]))
     told = []
     for group in found.groups:
         if group.kind != "flat" or group.exposure_s == darks_s:
@@ -39,7 +38,7 @@ def _growth(found: Survey, c: int, darks_s: float, off: np.ndarray, columns: int
         if kept.sum() <= FEWEST_HOT or saturates(highest):
             continue
         ratio = beyond_neighbours(level[None], columns)[0, kept] / off[1, kept]
-        error = OF_MEDIAN * 1.4826 * np.median(np.abs(ratio - np.median(ratio))) / np.sqrt(kept.sum())
+        error = OF_MEDIAN * robust_sigma(ratio - np.median(ratio)) / np.sqrt(kept.sum())
         apart = group.exposure_s - darks_s
         told.append(((np.median(ratio) - 1) / apart, max(error, 1e-12) / abs(apart)))
     if not told:

@@ -8,6 +8,7 @@ from functools import reduce
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.flags import are_dim
 
 MOST = 0.02  # of the pixels: more are no exception
@@ -71,7 +72,7 @@ def _dead(counts: Sequence[np.ndarray], kind: Sequence[str]) -> np.ndarray:
         return none
     bright = max(lit, key=lambda some: float(np.median(some[0])))
     signal = bright.mean(0, dtype=np.float32) - dark[0].mean(0, dtype=np.float32)
-    noise = np.median(np.abs(np.diff(bright[:2].astype(np.float32), axis=0))) / 0.6745 / np.sqrt(2 * len(bright))
+    noise = robust_sigma(np.diff(bright[:2].astype(np.float32), axis=0)) / np.sqrt(2 * len(bright))
     return are_dim(signal, float(noise))
 
 

@@ -11,6 +11,7 @@ import scipy  # its parts are imported when they are used
 
 from hsnoise._core.keys import key_of, named_key, numbered_keys
 from hsnoise._core.naming import named, setting
+from hsnoise._core.robust import robust_sigma
 from hsnoise._core.types import RandomKey, cfa_tile, channel_index
 from hsnoise.chain.shared import Shared
 from hsnoise.effects import Stage
@@ -188,5 +189,5 @@ def _without_spikes(plane: np.ndarray) -> np.ndarray:
     """The plane with the median of their surroundings in place of single pixels that lie far from it."""
     beside = scipy.ndimage.median_filter(plane, 3, mode="mirror")
     off = np.abs(plane - beside)
-    usual = max(1.4826 * float(np.median(off)), LEAST_DN)  # where most pixels have the same count, others are no spikes
+    usual = max(robust_sigma(off), LEAST_DN)  # where most pixels have the same count, others are no spikes
     return np.where(off > SPIKE * usual, beside, plane)

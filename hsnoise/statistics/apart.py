@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.spectra import periodogram
 
 CORE_SIGMAS = 4.0  # offsets of frames, rows and columns come from values within
@@ -15,15 +16,14 @@ FAR_FRAME = 5.0  # deviations beyond which a frame's offset is an outlier
 HIT_SIGMAS = 8.0  # deviation of one frame from all others of a pixel that is a hit, such as a cosmic ray
 FEWEST_FRAMES = 4  # of which one can be told to be a hit
 ORDINARY = 0.999  # of the pixels
-NORMAL_QUANTILE = 1.4826
 ROUNDING_DN = 1 / 12**0.5  # standard deviation of rounding: counts apart by one are no outliers
 MOST_OF_SPREAD = 200_000  # values from which a width is taken
 
 
 def core_sigma(values: np.ndarray) -> float:
-    """Standard deviation of the core of values about 0: the median of the absolute values, scaled for normal ones."""
+    """`robust_sigma` of some of the values: as many as tell it."""
     thin = values.ravel()[:: max(1, values.size // MOST_OF_SPREAD)]
-    return NORMAL_QUANTILE * float(np.median(np.abs(thin)))
+    return robust_sigma(thin)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def typical_offset(frame: np.ndarray) -> float:
     """Mean of the offsets of frames [frame], or their median where one is far from all others."""
     middle = float(np.median(frame))
     off = np.abs(frame - middle)
-    return middle if off.max() > FAR_FRAME * NORMAL_QUANTILE * np.median(off) else float(frame.mean())
+    return middle if off.max() > FAR_FRAME * robust_sigma(off) else float(frame.mean())
 
 
 def _hits(x: np.ndarray, sigma: float) -> tuple[tuple[np.ndarray, ...], np.ndarray]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 
@@ -48,7 +49,7 @@ def _halves(stack: FrameStack, i: int) -> np.ndarray:
             colour = level[:, r::cell, c::cell]
             colour -= np.median(colour, axis=(1, 2), keepdims=True)
     middle = np.median(level)
-    width = 5 * 1.4826 * float(np.median(np.abs(level - middle))) + 1e-9
+    width = 5 * robust_sigma(level - middle) + 1e-9
     level = np.clip(level, middle - width, middle + width)  # hot pixels
     edges = [[n * of // GRID for of in range(GRID)] for n in (rows, columns)]
     sizes = [np.diff([*of, n]) for of, n in zip(edges, (rows, columns), strict=True)]

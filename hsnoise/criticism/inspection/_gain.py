@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hsnoise._core.naming import setting
+from hsnoise._core.robust import robust_sigma
 from hsnoise._core.types import StatedGain
 from hsnoise.criticism.budget import BudgetRow, NoiseBudget
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
@@ -104,7 +105,7 @@ def _pairs(facts: Facts, zero: BudgetRow) -> list[_Level]:
         if not 0 < max(a, b) < NEAR_LIGHT * min(a, b):
             continue
         difference = np.diff(frames[0] / a - frames[1] / b, axis=1).ravel()
-        limit = FAR * 1.4826 * np.median(np.abs(difference))
+        limit = FAR * robust_sigma(difference)
         variance = float(np.mean(difference[np.abs(difference) < limit] ** 2)) / 2
         read = zero.components["temporal"].variance_dn2 * (1 / a**2 + 1 / b**2)
         error = (2 * 1.5 / difference.size) ** 0.5  # neighbours share a pixel

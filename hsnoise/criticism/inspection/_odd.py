@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, together
 from hsnoise.statistics.pixels.oddities import brighter_kind
@@ -93,7 +94,7 @@ def _levels(group: GroupFacts, darks: Sequence[GroupFacts]) -> Iterator[str]:
         )
         return
     rest = levels - (_line(levels) if len(levels) >= FEWEST else np.median(levels))
-    spread = 1.4826 * np.median(np.abs(rest - np.median(rest)))
+    spread = robust_sigma(rest - np.median(rest))
     far = np.abs(rest) > max(FAR * spread, LEAST_DN, LEAST_SHARE * group.temporal_dn)
     usual = np.flatnonzero(~far)
     for j in np.flatnonzero(far):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise._core.robust import OF_MEDIAN, robust_sigma
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.survey import Plane, Survey
 from hsnoise.statistics.pixels.taps import Taps
@@ -57,7 +58,7 @@ def _growth(short: Plane, long: Plane) -> tuple[float, float]:
     """Of the level of the typical pixel between two exposures, DN, and its standard error by how pixels differ."""
     grown = long.halves.level_dn.mean(0) - short.halves.level_dn.mean(0)
     typical = float(np.median(grown))
-    return typical, 1.2533 * 1.4826 * float(np.median(np.abs(grown - typical))) / np.sqrt(len(grown))
+    return typical, OF_MEDIAN * robust_sigma(grown - typical) / np.sqrt(len(grown))
 
 
 def outputs(result: FitResult) -> Iterator[str]:

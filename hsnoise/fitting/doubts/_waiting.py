@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.classes import Levels, hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.sample import covariance_of
@@ -46,7 +47,7 @@ def _waiting_s(pixels: Levels) -> tuple[float, float]:
     if spread <= 0:
         return 0.0, np.inf
     off, of_growth = (one - np.median(one, axis=1, keepdims=True) for one in (offset, growth))
-    width = FAR * 1.4826 * np.median(np.abs(off))
+    width = FAR * robust_sigma(off)
     off = np.clip(off, -width, width)
     terms = (off * (of_growth[::-1] - of_growth.mean())).mean(0)
     return float(terms.mean() / spread), float(terms.std() / np.sqrt(len(terms)) / spread)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS
 from hsnoise.statistics.pixels.waves import Wave, without_waves
 
@@ -89,7 +90,7 @@ def _bounded(change: np.ndarray, colours: int) -> np.ndarray:
         part = change[:, first::colours]
         part -= np.median(part, axis=1, keepdims=True)
     change -= np.median(change, axis=0)
-    far = np.abs(change) > CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
+    far = np.abs(change) > CORE_SIGMAS * robust_sigma(change)
     near = far.copy()
     for step in range(1, BESIDE + 1):  # tracks of particles are as faint at their ends as noise
         near[:, step:] |= far[:, :-step]

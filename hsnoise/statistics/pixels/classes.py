@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.clipping import unclipped
 from hsnoise.statistics.pixels.survey import Survey
 
@@ -193,7 +194,7 @@ def hot_from(growth: np.ndarray) -> float:
 def growth_noise(growth: np.ndarray) -> float:
     """Standard deviation by chance of a pixel's growth in one half of the frames, DN/s; growth [half, pixel]."""
     apart = growth[0] - growth[1]
-    return 1.4826 * float(np.median(np.abs(apart - np.median(apart)))) / np.sqrt(2)
+    return robust_sigma(apart - np.median(apart)) / np.sqrt(2)
 
 
 def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
@@ -204,7 +205,7 @@ def _pedestal_sigmas(offsets: list[np.ndarray]) -> np.ndarray:
     near, scatter = [], []
     for of in offsets:
         off = np.abs(of - np.median(of))
-        near.append(of[off <= FAR_FRAME * 1.4826 * np.median(off)] if len(of) > 3 else of)
+        near.append(of[off <= FAR_FRAME * robust_sigma(off)] if len(of) > 3 else of)
         scatter.append(near[-1].var(ddof=1) if len(near[-1]) > 1 else 0.0)
     dof = np.array([len(of) - 1 for of in near])
     pooled = float(dof @ scatter / max(dof.sum() - 2, 1))  # for few frames, as wide as Student's t

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.special import erfcx, kl_div, ndtr
 
 from hsnoise._core.quadrature import normal_nodes
+from hsnoise._core.robust import robust_sigma
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 
@@ -145,7 +146,7 @@ def fitted(growth: np.ndarray, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """(mean, spread, skew, fraction, rate, hot spread) of the growth [pixel], and errors; zeros for what is not
     significant."""
     middle = float(np.median(growth))
-    core = 1.4826 * float(np.median(np.abs(growth - middle)))
+    core = robust_sigma(growth - middle)
     if core <= 0:
         return np.array([max(middle, 0.0), *np.zeros(5)]), np.full(6, np.inf)
     is_dark = middle > LEAST_MEAN * core

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from hsnoise._core.robust import OF_MEDIAN, robust_sigma
 from hsnoise._core.types import cfa_tile
 from hsnoise.statistics.pixels.classes import Levels, slope_over
 from hsnoise.statistics.pixels.structure import covariance_terms
@@ -53,9 +54,7 @@ def glow_of(found: Survey, channel: int) -> Glow | None:
     if len(blocks) < BLOCKS**2 // 2:
         return None
     typical = np.array([np.median(growth[of]) for of in blocks])
-    scatter = np.array(
-        [1.2533 * 1.4826 * np.median(np.abs(growth[of] - m)) for of, m in zip(blocks, typical, strict=True)]
-    )
+    scatter = np.array([OF_MEDIAN * robust_sigma(growth[of] - m) for of, m in zip(blocks, typical, strict=True)])
     error = scatter / np.sqrt([len(of) for of in blocks])
     glow = _fitted(np.array([places[:, of].mean(1) for of in blocks]).T, typical, np.maximum(error, 1e-9))
     if glow is None:

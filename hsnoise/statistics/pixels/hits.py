@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
+from hsnoise._core.robust import robust_sigma
+
 FEWEST_FRAMES, FEWEST_TWICE = 4, 6  # from which one frame, and two, can be told from the others
 FAR, CALM = 8.0, 5.0  # deviations of a hit, at least, and of the pixel's other frames, at most
 ALIKE = 0.1  # share of the hits that may look like tails or jumps: below the level, or twice in a pixel
@@ -38,7 +40,7 @@ def hits_of(values: np.ndarray) -> Hits | None:
         return None
     ordered = np.sort(values, axis=0)
     middle = ordered[frames // 2]
-    typical = 1.4826 * float(np.median(np.abs(values - middle))) * np.sqrt(frames / (frames - 1))
+    typical = robust_sigma(values - middle) * np.sqrt(frames / (frames - 1))
 
     def deviation(calm: np.ndarray) -> np.ndarray:
         """Of a pixel from its calm frames, with the shot noise of hot pixels, in units of the typical pixel's."""

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.robust import NORMAL, robust_sigma
+
 LEAST_LIT = 0.2  # of the mean signal: corners that get less tell little
 OUTLYING = 5.0  # deviations beyond which a line does not count more
 CORE_SIGMAS = 4.0  # pixels of a line further off are dust, defects or hot pixels
@@ -72,7 +74,7 @@ def line_response(
         parity = _parity(mean * odd)
         if abs(parity[0]) > PARITY_THERE * parity[1]:
             mean = mean - parity[0] * odd
-    square = np.minimum(mean**2, (OUTLYING * 1.4826 * np.median(np.abs(mean))) ** 2)
+    square = np.minimum(mean**2, (OUTLYING * robust_sigma(mean)) ** 2)
     error = square.std() * np.sqrt(ALIKE / len(square))
     return LineResponse(
         (float(square.mean() / BESIDE - weight**2 @ noise - pixel_variance / places), error / BESIDE), parity
@@ -98,7 +100,7 @@ def _profile(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     excess = np.where(lit, np.log(np.maximum(signal[1:-1], least / 2) / np.maximum(around, least)), np.nan)
     middle = np.nanmedian(excess, axis=1, keepdims=True)
     off = excess - middle
-    width = CORE_SIGMAS * 1.4826 * float(np.nanmedian(np.abs(off)))
+    width = CORE_SIGMAS * NORMAL * float(np.nanmedian(np.abs(off)))
     return middle[:, 0] + np.nanmean(np.clip(off, -width, width), axis=1), number
 
 
@@ -108,7 +110,7 @@ def _parity(contrast: np.ndarray) -> tuple[float, float]:
     Each line is in three of these values with the same sign: their mean is less certain than if they were independent.
     """
     middle = float(np.median(contrast))
-    sigma = 1.4826 * float(np.median(np.abs(contrast - middle)))
+    sigma = robust_sigma(contrast - middle)
     middle = float(np.clip(contrast, middle - OUTLYING * sigma, middle + OUTLYING * sigma).mean())
     pieces = np.array([np.median(of) for of in np.array_split(contrast, PIECES)])
     error = 2 * sigma / np.sqrt(BESIDE * len(contrast))

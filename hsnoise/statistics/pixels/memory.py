@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
+
 FEWEST_FRAMES = 4
 PARTS, MOST_PIXELS = 16, 1 << 18  # of a plane, which tell the error
 WIDTH = 4.0  # deviations at which differences are cut: jumping and hit pixels say nothing here
@@ -56,7 +58,7 @@ def memory_of(values: np.ndarray) -> Memory | None:
     if len(values) < FEWEST_FRAMES or values.shape[1] < PARTS:
         return None
     thin = values[:, :: max(1, values.shape[1] // MOST_PIXELS)]
-    width = WIDTH * 1.4826 * float(np.median(np.abs(thin[1] - thin[0])))
+    width = WIDTH * robust_sigma(thin[1] - thin[0])
     if width <= 0:
         return None
     square = [_mean_square(thin, apart, width) for apart in (1, 2, 3)]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hsnoise._core.naming import setting
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.flags import counts_of, flags_of
 from hsnoise.statistics.pixels.survey import Group, Survey
 
@@ -119,7 +120,7 @@ def _odd_levels(found: Survey) -> Iterator[tuple[Group, int, float]]:
             continue
         level = np.mean([p.halves.frame_means_dn for p in group.planes], axis=0)
         off = level - np.median(level)
-        scatter = max(1.4826 * float(np.median(np.abs(off))), LEAST_LEVEL_DN / ODD_LEVEL)
+        scatter = max(robust_sigma(off), LEAST_LEVEL_DN / ODD_LEVEL)
         pixel = float(np.median(_noise_of_frames(group)))
         for f in np.flatnonzero((np.abs(off) > ODD_LEVEL * scatter) & (np.abs(off) > 0.2 * pixel)):
             yield group, int(f), float(off[f])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.classes import Levels, growth_noise, slope_over
 from hsnoise.statistics.pixels.dark_currents import Noise, fitted, growth_cdf, relative_width
 from hsnoise.statistics.pixels.sample import of_neighbours
@@ -174,7 +175,7 @@ def beyond_neighbours(levels: np.ndarray, columns: int) -> np.ndarray:
 def warm_of(off: np.ndarray) -> Warm | None:
     """The warm pixels of one exposure; None where there are none. off [half, pixel]: levels `beyond_neighbours`."""
     extra = off.mean(0) - np.median(off.mean(0))
-    noise = 1.4826 * float(np.median(-extra[extra < 0])) if (extra < 0).any() else 0.0
+    noise = robust_sigma(-extra[extra < 0]) if (extra < 0).any() else 0.0
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
         return None
     values, errors = fitted(extra, Noise(noise))
@@ -227,7 +228,7 @@ def shared_variance(pattern: np.ndarray) -> tuple[float, float]:
 
 def winsorised(values: np.ndarray) -> np.ndarray:
     """Values with a median near 0, outliers cut, less their mean."""
-    width = WINSOR_SIGMAS * 1.4826 * float(np.median(np.abs(values)))
+    width = WINSOR_SIGMAS * robust_sigma(values)
     cut = np.clip(values, -width, width).astype(np.float64)
     return cut - cut.mean()
 
@@ -251,5 +252,5 @@ def _at_readout(pixels: Levels, halves: np.ndarray, noise: float, rate: float) -
     growth = halves[1][hot].astype(np.float64) - median
     extra = offset[hot].astype(np.float64) - np.median(offset)
     ratio = float(np.median(extra / growth))
-    scatter = 1.4826 * float(np.median(np.abs(extra / growth - ratio))) / np.sqrt(len(growth))
+    scatter = robust_sigma(extra / growth - ratio) / np.sqrt(len(growth))
     return (ratio * rate, scatter * rate) if ratio > 3 * scatter else (0.0, scatter * rate)

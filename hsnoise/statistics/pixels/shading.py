@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from hsnoise._core.robust import robust_sigma
+
 LENGTHS = (*np.geomspace(0.01, 3.0, 20), 10.0)  # in widths of the frame; the last is a straight line
 LEAST_SHARE = 0.3  # of the variance of the means that a shading must explain
 THERE = 5.0  # standard errors
@@ -79,7 +81,7 @@ def _without_defects(means_dn: np.ndarray) -> np.ndarray:
     """Means of lines [n], DN, those far off their neighbours replaced by these."""
     around = median_filter(means_dn, NEIGHBOURS, mode="nearest")
     off = np.abs(means_dn - around)
-    return np.where(off > FAR * 1.4826 * np.median(off), around, means_dn)
+    return np.where(off > FAR * robust_sigma(off), around, means_dn)
 
 
 def _shape(lines: int, start: str, length: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from hsnoise._core.robust import NORMAL, robust_sigma
 from hsnoise.statistics.pixels.classes import HOT_SIGMAS
 from hsnoise.statistics.pixels.sample import covariance_of, median_share
 from hsnoise.statistics.pixels.survey import Group, Plane, Survey
@@ -116,7 +117,7 @@ def low_side_sigma(level: np.ndarray, rows: float, frames: int) -> float:
 
 def covariance_terms(pattern: np.ndarray) -> np.ndarray:
     """Winsorised products of two halves [half, place], whose mean is the variance of what both share."""
-    width = WINSOR_SIGMAS * 1.4826 * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
+    width = WINSOR_SIGMAS * NORMAL * np.median(np.abs(pattern), axis=1, keepdims=True) + 1e-6
     a, b = np.clip(pattern, -width, width).astype(np.float64)
     return (a - a.mean()) * (b - b.mean())
 
@@ -141,7 +142,7 @@ def variance_grows(found: Survey) -> bool:
         for group in (groups[0], groups[-1]):
             variance = group.pixels(c, "pair_variance_dn2")
             middle = float(np.median(variance))
-            width = 1.4826 * float(np.median(np.abs(variance - middle)))
+            width = robust_sigma(variance - middle)
             # With few frames the median lies below the mean, by the same factor for all pixels.
             share = median_share(group.n_frames)
             ends.append((middle / share, 1.25 * width / share / np.sqrt(len(variance))))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouring_rows, with_tails
@@ -314,7 +315,7 @@ def _blocks(counts: np.ndarray, half: int) -> np.ndarray | None:
     for frame in counts:
         change = frame - mean
         middle = float(np.median(change))
-        width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change - middle)))
+        width = CORE_SIGMAS * robust_sigma(change - middle)
         cut = np.clip(change, middle - width, middle + width)
         of_columns = np.stack([part.mean(0) for part in np.split(cut, [half])])
         sizes = np.diff([*edges, columns])
@@ -350,7 +351,7 @@ def _neighbours_share(counts: np.ndarray) -> float:
     change = counts[1].astype(np.float32) - counts[0]
     change -= np.median(change, axis=1, keepdims=True)
     change -= np.median(change, axis=0)
-    width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(change)))
+    width = CORE_SIGMAS * robust_sigma(change)
     change = np.clip(change, -width, width)
     variance = float(np.mean(change**2, dtype=np.float64))
     return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.classes import FILLED
 from hsnoise.statistics.pixels.sample import without_outliers
 from hsnoise.statistics.pixels.survey import Group, Plane, Survey
@@ -233,7 +234,7 @@ def _alternates(values: np.ndarray) -> bool:
     profile = np.median(values, axis=0)
     beside = (profile[1:-1] - (profile[:-2] + profile[2:]) / 2) * (-1.0) ** np.arange(len(profile) - 2)
     pieces = np.array([np.median(of) for of in np.array_split(beside, PIECES)])
-    error = 1.4826 * float(np.median(np.abs(beside - np.median(beside)))) / np.sqrt(len(beside))
+    error = robust_sigma(beside - np.median(beside)) / np.sqrt(len(beside))
     return bool(abs(np.median(beside)) > SEAM * error and (np.sign(pieces) == np.sign(pieces[0])).all())
 
 
@@ -266,7 +267,7 @@ def _is_seam(profile: np.ndarray, edge: int, edges: Iterable[int]) -> bool:
     if len(elsewhere) < FEWEST_PLACES:
         return False
     middle = float(np.median(elsewhere))
-    typical = 1.4826 * float(np.median(np.abs(elsewhere - middle)))
+    typical = robust_sigma(elsewhere - middle)
     here = np.abs(steps - middle)
     near = np.abs(at - edge) <= reach
     return bool(here[at == edge][0] > SEAM * typical and np.abs(at[near][here[near].argmax()] - edge) <= 1)

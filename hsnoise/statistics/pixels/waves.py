@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from hsnoise._core.robust import robust_sigma
 from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 
@@ -66,7 +67,7 @@ def spectrum_of(parts: Sequence[np.ndarray], cell: int) -> Spectrum | None:
     left = np.stack(parts).astype(np.float32)
     left -= left.mean(0)
     left *= np.sqrt(len(left) / (len(left) - 1))
-    width = CORE_SIGMAS * 1.4826 * float(np.median(np.abs(left)))
+    width = CORE_SIGMAS * robust_sigma(left)
     np.clip(left, -width, width, out=left)
     left -= left.mean(1, keepdims=True)
     left -= left.mean(2, keepdims=True)
