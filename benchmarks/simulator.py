@@ -203,9 +203,10 @@ def _static_of(effect: str, size: float, camera: Camera, rng, shape) -> dict[str
         out["read"] = spread / np.sqrt((spread**2).mean())
     elif effect == "correlated_read_noise":
         out["memory"], out["alternates"] = float(rng.uniform(0.3, 0.8)), bool(rng.integers(2))
-    elif effect in ("periodic_banding", "interference"):
+    elif effect == "periodic_banding":
         out["frequency"] = float(rng.uniform(0.03, 0.45))
-        out["across"] = float(rng.uniform(-0.45, 0.45))
+    elif effect == "interference":
+        out["down"], out["across"] = rng.uniform(0.03, 0.45), rng.uniform(-0.45, 0.45)
     elif effect == "row_group_noise":
         together = int(rng.choice([4, 8, 16]))
         out["group"] = (np.arange(rows) + rng.integers(together)) // together
@@ -305,7 +306,7 @@ def _moving(effect, size, hidden, rng, frames: int, shape) -> np.ndarray | float
         phase = rng.uniform(0, 2 * np.pi, (frames, 1, 1))
         return size * np.sin(2 * np.pi * hidden["frequency"] * np.arange(rows)[None, :, None] + phase)
     if effect == "interference":
-        turns = hidden["frequency"] * np.arange(rows)[:, None] + hidden["across"] * np.arange(columns)
+        turns = hidden["down"] * np.arange(rows)[:, None] + hidden["across"] * np.arange(columns)
         return size * np.sin(2 * np.pi * (turns + rng.random((frames, 1, 1))))
     if effect == "row_bank_noise":
         kicks = rng.standard_normal((2, frames, rows // 2)) * np.sqrt(1 - 0.9**2)

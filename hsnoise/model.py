@@ -309,9 +309,10 @@ def sample_by_effect(
     FrameStack, where the frames lie on a larger sensor; shared: what draws of other models may have in common with
     these. Returns counts [exposure, frame, row, column].
     """
+    check_not_forked()
     exposures = np.array([checked_exposure(exposure_s) for exposure_s in exposures_s], float)
-    shape = (n_frames, *light.shape[1:])
-    return apply_by_effect(keys, *_on_sensor(light, shape, params, exposures, sensor_key, window), shared, quick=True)
+    checked, shape = checked_light(light, params.cfa), (n_frames, *light.shape[1:])
+    return apply_by_effect(keys, *_on_sensor(checked, shape, params, exposures, sensor_key, window), shared, quick=True)
 
 
 def dark_signals(
@@ -340,16 +341,16 @@ def _prepared(key, clean, params, exposure_s, sensor_key):
     check_not_forked()
     key = key_of("key", key)
     sensor_key = named_key(key, "sensor_key") if sensor_key is None else key_of("sensor_key", sensor_key)
-    clean, *_ = checked_light(clean, params.cfa)
+    light = checked_light(clean, params.cfa)
     exposure = checked_exposure(params.exposure_s if exposure_s is None else exposure_s)
-    shape = (math.prod(clean.shape[:-2]), *clean.shape[-2:])
-    return key, *_on_sensor(clean, shape, params, exposure, sensor_key)
+    *frames, rows, columns = light[0].shape
+    return key, *_on_sensor(light, (math.prod(frames), rows, columns), params, exposure, sensor_key)
 
 
-def _on_sensor(clean, shape, params, exposure_s, sensor_key, window=None) -> tuple[Array, tuple, tuple, Capture]:
-    """Light, shape, effects and capture of an exposure, or of several [exposure], with frames of `shape`."""
+def _on_sensor(light, shape, params, exposure_s, sensor_key, window=None) -> tuple[Array, tuple, tuple, Capture]:
+    """Light (see `checked_light`), shape, effects, capture of an exposure, or of several, with frames of `shape`."""
     dtype = jnp.result_type(float)
-    clean, low, high = checked_light(clean, params.cfa)
+    clean, low, high = light
     params = in_session_precision(params)
     effects = merged(params.effects, _regime(low, high, params, exposure_s))
     capture = Capture(
@@ -359,8 +360,7 @@ def _on_sensor(clean, shape, params, exposure_s, sensor_key, window=None) -> tup
         params.shutter,
         sensor_key,
         gain=next((effect.value for effect in effects if effect.name == "gain"), None),
-        # Read noise may be merged with the arrivals.
-        read_noise=params["read_noise"].sigma if "read_noise" in params else None,
+        read_noise=params["read_noise"].sigma if "read_noise" in params else None,  # may be merged with arrivals
         window=window,
     )
     of_frames = (*np.shape(exposure_s), -1, *shape[1:])

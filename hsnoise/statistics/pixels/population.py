@@ -175,7 +175,7 @@ def beyond_neighbours(levels: np.ndarray, columns: int) -> np.ndarray:
 def warm_of(off: np.ndarray) -> Warm | None:
     """The warm pixels of one exposure; None where there are none. off [half, pixel]: levels `beyond_neighbours`."""
     extra = off.mean(0) - np.median(off.mean(0))
-    noise = robust_sigma(-extra[extra < 0]) if (extra < 0).any() else 0.0
+    noise = robust_sigma(extra[extra < 0]) if (extra < 0).any() else 0.0
     if noise <= 0 or not _hot_again(off, WARM_SIGMAS * noise) or _as_cold(off, WARM_SIGMAS * noise):
         return None
     values, errors = fitted(extra, Noise(noise))
