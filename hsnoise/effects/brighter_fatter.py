@@ -11,6 +11,8 @@ from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
+LEAST_FILL_E = 1000  # 1 % of this a neighbour would be twenty times what is known of any sensor
+
 
 class BrighterFatter(AbstractEffect):
     """Pixels that fill repel electrons: each pair of neighbours of x and y electrons moves strength (x^2 - y^2) / 2.
@@ -40,7 +42,7 @@ class BrighterFatter(AbstractEffect):
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:
-        if not facts.shows_signal:
+        if facts.signal_e < LEAST_FILL_E:
             return None
         # A neighbour takes 1 % at the brightest level, which is 8 % of the variance.
         return lambda size, rng: cls(0.01 * size / (facts.signal_e + 2 * facts.read_noise_e))

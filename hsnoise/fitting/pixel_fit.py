@@ -34,6 +34,7 @@ from hsnoise.fitting.pixel_patterns import (
 from hsnoise.fitting.pixel_register import Multiplied, multiplied_of, with_flats
 from hsnoise.fitting.pixel_response import STRAIGHT, Bend, bend_of
 from hsnoise.fitting.pixel_rows import RowSpectrum, column_spectrum, row_gain_of_darks, row_spectrum
+from hsnoise.fitting.pixel_tilt import Tilted, straightened, tilted_in
 from hsnoise.fitting.pixel_warm import warm_in
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
@@ -132,6 +133,7 @@ class PixelFit:
     parity_told: whether noise tells what makes even and odd columns differ in light, if they do.
     waves: what crosses the frame obliquely and moves from frame to frame, the strongest first. It is in no read noise.
     comb: codes of unequal width, if they are. settling: the course of the black level over the frames, if it has one.
+    tilted: lines over rows or columns that are new in each frame, if there are; in no noise of rows or columns.
     shortest_s: the shortest exposure of repeated darks; 0 without any.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
@@ -146,6 +148,7 @@ class PixelFit:
     waves: tuple[Wave, ...]
     comb: Comb | None
     settling: Settling | None
+    tilted: Tilted | None
     shortest_s: float
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -157,11 +160,14 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     found = without_stuck(found)
     taps = taps_of(found)
     found = found if taps is None else levelled(found, taps)
+    tilted = tilted_in(found)
+    found = found if tilted is None else straightened(found, tilted)
     flats = _flat_gain(found, summary)
     told = flats if flats is not None and np.isfinite(flats.gain).all() else None
     register = multiplied_of(found, told)
     wander_dn2 = 0.0 if taps is None else taps.changes_dn2().get("temporal", 0.0)
-    channels = [_channel(found, c, name, register, told, wander_dn2) for c, name in enumerate(found.channels)]
+    shared = register, told, wander_dn2, tilted
+    channels = [_channel(found, c, name, *shared) for c, name in enumerate(found.channels)]
     channels = [with_law(one, law_of(found, c), narrow_of(found, c)) for c, one in enumerate(channels)]
     if told is not None:
         channels = [_with_flats(one, summary.flats, told, c) for c, one in enumerate(channels)]
@@ -175,13 +181,19 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
     ringing = None if found.shortest is None else of_read_noise(found.along, read_dn2, unlit=unlit)
     if ringing is not None:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
-    shared = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb, found.settling
+    apart = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb, found.settling
     shortest_s = 0.0 if found.shortest is None else found.shortest.exposure_s
-    return PixelFit(tuple(channels), flats, *shared, shortest_s, estimate, covariance, bool(known.all()))
+    return PixelFit(tuple(channels), flats, *apart, tilted, shortest_s, estimate, covariance, bool(known.all()))
 
 
 def _channel(
-    found: Survey, c: int, name: str, register: Multiplied | None, flats: FlatGain | None, wander_dn2: float
+    found: Survey,
+    c: int,
+    name: str,
+    register: Multiplied | None,
+    flats: FlatGain | None,
+    wander_dn2: float,
+    tilted: Tilted | None,
 ) -> Channel:
     """wander_dn2: variance of pixels over time that outputs make whose change is neither of rows nor of columns."""
     (growth, growth_error), black = growth_of_means(found, c)
@@ -221,7 +233,7 @@ def _channel(
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
-    shading = shadings_of(found, c, (spectrum.widened, of_columns.widened))
+    shading = shadings_of(found, c, (spectrum.widened, of_columns.widened), tilted)
     lines = lines_in(found, c, shading)
     offset = offset_of(found, c, population)
     warm = warm_in(found, c) if is_plain and not found.has_exposures else None
@@ -241,7 +253,7 @@ def _channel(
         covariance=covariance,
         black_dn=black,
         row_gain=row_gain(values[2]),
-        patterns=patterns_of(found, c, shading, lines),
+        patterns=patterns_of(found, c, shading, lines, tilted),
         lines=lines,
         temporal_dn2=floor,
         is_narrow=narrow is not None,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.fitting.pixel_lines import Lines, lines_of
+from hsnoise.fitting.pixel_tilt import Tilted
 from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.settling import Settling
@@ -58,10 +59,13 @@ def known_of_columns(found: Survey, c: int) -> float:
     return 0.0 if wave is None else wave.variance_dn2
 
 
-def shadings_of(found: Survey, c: int, widened: tuple[float, float] = (1.0, 1.0)) -> dict[str, Shading]:
+def shadings_of(
+    found: Survey, c: int, widened: tuple[float, float] = (1.0, 1.0), tilted: Tilted | None = None
+) -> dict[str, Shading]:
     """The drift of the black level along the rows or down the frame: a model has one.
 
     widened: as in `RowSpectrum`, of rows and of columns; slow noise drifts, too, and few frames do not average it out.
+    Nor do they average out what frames are tilted by.
     """
     planes, out = shortest_of(found, c), {}
     for axis, name in (("column", "column_mean_dn"), ("row", "row_mean_dn")):
@@ -72,6 +76,7 @@ def shadings_of(found: Survey, c: int, widened: tuple[float, float] = (1.0, 1.0)
             # In the shape of a shading: all of it, if a few slow waves make the noise.
             slow = min(2 * widened[AXES.index(axis)] ** 2 / len(means), 1.0)
             chance = np.sqrt(max(of_lines_dn2, 0.0) / found.shortest.n_frames * slow)
+            chance = np.hypot(chance, np.sqrt(_of_tilts(tilted, axis, c)))
             one = shading_of(means, float(noise), float(chance))
             out |= {} if one is None else {axis: one}
     # The larger of two that are certain; else the more certain, which a few frames less still show.
@@ -94,7 +99,11 @@ def lines_in(found: Survey, c: int, shading: Mapping[str, Shading]) -> dict[str,
 
 
 def patterns_of(
-    found: Survey, c: int, shading: Mapping[str, Shading], lines: Mapping[str, Lines]
+    found: Survey,
+    c: int,
+    shading: Mapping[str, Shading],
+    lines: Mapping[str, Lines],
+    tilted: Tilted | None = None,
 ) -> dict[str, tuple[float, float, float]]:
     """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
     planes, out = shortest_of(found, c), {}
@@ -119,12 +128,18 @@ def patterns_of(
             shared = _about(course, shared, planes)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
+        of_mean += _of_tilts(tilted, component, c)
         out[effect] = (
             shared.variance_dn2 - known.get(component, 0.0),
             float(np.hypot(shared.standard_error_dn2, scatter.get(component, 0.0))),
             float(np.hypot(shared.chance_dn2, max(of_mean, scatter.get(component, 0.0)))),
         )
     return out
+
+
+def _of_tilts(tilted: Tilted | None, axis: str, c: int) -> float:
+    """Variance of static rows or columns that the frames' tilts leave, DN^2."""
+    return 0.0 if tilted is None or tilted.axis != axis else float(tilted.of_mean_dn2[c])
 
 
 def _about(course: Settling, frame: Component, planes: list[Plane]) -> Component:

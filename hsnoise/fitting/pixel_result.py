@@ -25,6 +25,7 @@ from hsnoise.effects import (
     ElectronMultiplication,
     FrameOffset,
     FrameSettling,
+    FrameTilt,
     HotPixels,
     Interference,
     MissingCodes,
@@ -48,7 +49,7 @@ from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
 from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
-from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, offsets_of, shared_patterns, with_parity
+from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, shared_of, with_parity
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -75,6 +76,7 @@ OF_PIXELS = (
     BrighterFatter,
     FrameOffset,
     FrameSettling,
+    FrameTilt,
     RowFixedPattern,
     ColumnFixedPattern,
     RowNoise,
@@ -110,9 +112,7 @@ def followed(found: Survey) -> set[str]:
 def result_of(pixel: PixelFit, summary: Summary, model: NoiseModel | None, stack) -> FitResult:
     """The result; `model` says which effects are wanted (None: the paper's, and those of the population found)."""
     gain, read, rate = _electrons(pixel)
-    shared = shared_patterns(pixel.channels, gain, summary.cfa)
-    if (offsets := offsets_of(pixel.channels, gain, summary.cfa)) is not None:
-        shared["dark_signal_nonuniformity"] = offsets
+    shared = shared_of(pixel.channels, pixel.tilted, gain, stack)
     population = _with_banks(_population(pixel, gain, shared), pixel, model)
     wanted = [*BASE, *population] if model is None else list(model.names)
     added = tuple(name for name in population if model is None)
@@ -337,7 +337,8 @@ def _model(
 def _settings(name: str, pixel: PixelFit, shared: Mapping[str, Shared]) -> dict[str, Any]:
     """What an effect has besides numbers."""
     if name in shared:
-        return {"after_gain": shared[name].after_gain}
+        along = {"axis": pixel.tilted.axis} if name == "frame_tilt" and pixel.tilted is not None else {}
+        return along | {"after_gain": shared[name].after_gain}
     if name == "frame_settling":
         return {"after_gain": len(pixel.channels) > 1}  # alike in DN in all colours
     if name == "black_shading" and (drift := _shading(pixel)) is not None:

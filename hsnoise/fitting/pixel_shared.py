@@ -10,6 +10,8 @@ import numpy as np
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import PATTERNS
+from hsnoise.fitting.pixel_tilt import Tilted
+from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.pixels.glow import Glow
 from hsnoise.statistics.pixels.settling import Settling
 from hsnoise.statistics.pixels.taps import GAINS_APART, LEAST, Taps
@@ -60,6 +62,29 @@ def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> 
             of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
             found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
     return found
+
+
+def shared_of(
+    channels: Sequence[Channel], tilted: Tilted | None, gain: np.ndarray, stack: FrameStack
+) -> dict[str, Shared]:
+    """What is shared beyond chance, and the offsets of pixels, by the effect that draws it."""
+    found = shared_patterns(channels, gain, stack.cfa)
+    if (offsets := offsets_of(channels, gain, stack.cfa)) is not None:
+        found["dark_signal_nonuniformity"] = offsets
+    if tilted is not None:
+        found["frame_tilt"] = slopes_of(tilted, gain, stack)
+    return found
+
+
+def slopes_of(tilted: Tilted, gain: np.ndarray, stack: FrameStack) -> Shared:
+    """Slopes of the frames, from end to end of the sensor, of which they may be a part."""
+    i = ("row", "column").index(tilted.axis)
+    longer = 1.0 if stack.window is None else (stack.window[2 + i] - 1) / (stack.shape[i] - 1)
+    after = is_after_gain(tilted.seen_dn2[:, 0], tilted.seen_dn2[:, 1], gain)
+    scale = np.full(len(gain), gain[cfa_tile(stack.cfa)].mean()) if after else gain
+    variance, error = np.mean(tilted.slope_dn2 / scale[:, None] ** 2, 0)  # the same frames tell all colours
+    sigma = float(np.sqrt(variance))
+    return Shared((longer * sigma, longer * float(error) / (2 * sigma)), after)
 
 
 def with_parity(

@@ -145,6 +145,20 @@ def scales(sheet: Sheet, x: Exposures) -> None:
         sheet.add(group, "low-order shape", value, np.sqrt(2 / 3 * frames / (frames - 1)))
 
 
+def tilts(sheet: Sheet, x: Exposures) -> None:
+    """How much more of the slow course of a frame's rows and columns is its slowest cosine, a tilt, than the next two.
+
+    Slow noise has all three; a line from end to end hardly has the others.
+    """
+    frames = x.shape[1]
+    if frames == 1:
+        return
+    for group, moving in (("row x frame", x.row_frame), ("column x frame", x.column_frame)):
+        power = np.square(moving.sum(1) @ cosines(moving.shape[-1]).T).mean(1)
+        value = log_ratio(power[:, 0], power[:, 1:].mean(1))
+        sheet.add(group, "tilt of the frames", value, np.sqrt(3 / (frames - 1)))
+
+
 def responses(sheet: Sheet, x: Exposures) -> None:
     """Static rows and columns less the mean of those on both sides, where light that varies smoothly cancels.
 

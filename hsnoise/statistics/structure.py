@@ -49,6 +49,7 @@ STATISTICS: Statistics = (
     _lines.colours,
     _lines.together,
     _lines.scales,
+    _lines.tilts,
     _lines.noise_of_rows,
     _lines.spectra,
     _pixels.lags,
@@ -72,6 +73,8 @@ WORDS = {
     " their edges",
     "coherence": "coherence: how much of a frequency band the colours have in common",
     "strongest frequency": "strongest frequency: how much of the static rows (columns) is a single sine",
+    "tilt of the frames": "tilt of the frames: how much of the slow course over the rows (columns) is one slope, new in"
+    " each frame",
     "steps of ": "steps of n: how much the mean changes from n rows (columns) to the next n",
     "parity": "parity: even against odd rows (columns)",
     "kurtosis": "log kurtosis: weight of the tails, 0 for a normal distribution",

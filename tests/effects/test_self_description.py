@@ -51,7 +51,7 @@ RICH = CaptureFacts(
     has_bias=True,
     exposures_differ=True,
     levels=5,
-    light_e=150.0,
+    light_e=1500.0,
     line=("row", 0.13),
     waves=((1.0, -0.13, 0.37), (0.5, 0.2, 0.4)),
     places=Places(("column", "last", True, 0.3), (1.0, 0.5), -1, 1),
@@ -185,6 +185,7 @@ def test_a_poor_capture_is_offered_little():
     assert hot.rate == rays.rate == 0 and hot.at_readout > 0 and rays.at_readout > 0
     assert set(built_in(RICH)) == {effect.name for effect in PROPOSED}
     assert "electron_multiplication" not in built_in(dataclasses.replace(RICH, read_noise_e=3.5))
+    assert "brighter_fatter" not in built_in(dataclasses.replace(RICH, light_e=500.0))
     assert "row_noise" not in built_in(dataclasses.replace(RICH, effects=("row_noise",)))
     assert "shared_row_gain" not in built_in(dataclasses.replace(RICH, cfa="mono"))
 
@@ -274,7 +275,8 @@ def test_it_is_found_in_a_capture_that_has_it(effect, monkeypatch):
     )  # this one swings so fast that neighbours hardly show it
     truth = camera.add(made(effect.propose(RICH), size, 1))
     rng = np.random.default_rng(0)
-    exposure_s, kinds, means = (0.02, 0.05, 0.1, 0.2, 0.05, 0.05), ["dark"] * 4 + ["flat"] * 2, [70] * 4 + [300, 500]
+    lit = [1500, 4500] if effect.name == "brighter_fatter" else [300, 500]
+    exposure_s, kinds, means = (0.02, 0.05, 0.1, 0.2, 0.05, 0.05), ["dark"] * 4 + ["flat"] * 2, [70] * 4 + lit
     counts = [rng.integers(mean - 9, mean + 9, (8, 96, 128)).astype(np.uint16) for mean in means]
     like = hsnoise.FrameStack(counts, exposure_s, kind=kinds, cfa="RGGB", shutter="global")
     stack = draw_capture(900, truth, like)

@@ -23,6 +23,7 @@ from hsnoise.statistics.pixels.register import Register, register_of
 from hsnoise.statistics.pixels.row_groups import RowGroups, row_groups_of, shortest_repeated
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS, Halves, halves_of, sampled_rows
 from hsnoise.statistics.pixels.settling import Settling, settling_of
+from hsnoise.statistics.pixels.tilt import Tilt, tilt_of
 from hsnoise.statistics.pixels.waves import Spectrum, Wave, spectrum_of, waves_of
 
 NOISY_DN = 0.5  # temporal deviation above which a pixel that never changes is stuck
@@ -42,6 +43,7 @@ class Plane:
     exceeds the error for independent rows: slow noise, bands, and noise that is stronger in some frames.
     banding: by axis, a sinusoid over rows or columns that moves from frame to frame; of mono frames alone, as lines of
     every second row do not tell its frequency.
+    tilts: by axis, how rows or columns are tilted from frame to frame, of several frames.
     single_dn: sampled pixels of an exposure of one frame [pixel], DN; None of several.
     blocks_dn: mean change of blocks of the frame [frame, half of the rows, sixteenth of the columns] from the mean of
         the frames, DN; of the shortest repeated darks alone.
@@ -59,6 +61,7 @@ class Plane:
     columns_together: tuple[Component, Component]
     rows_error_dn2: float
     banding: dict[str, Banding]
+    tilts: dict[str, Tilt]
     halves: Halves | None
     single_dn: np.ndarray | None
     blocks_dn: np.ndarray | None
@@ -296,6 +299,7 @@ def _plane(
         columns_together=(of_neighbouring_rows(column_frame), of_neighbouring_rows(column_frame, 2)),
         rows_error_dn2=max(components["row_x_frame"].standard_error_dn2, _by_frames(row_frame)),
         banding={} if step > 1 else _banding(row_frame, column_frame),
+        tilts=_tilts(row_frame, column_frame),
         halves=halves,
         single_dn=counts[0].ravel().astype(np.float32) if n == 1 else None,
         blocks_dn=None if half is None or n == 1 else _blocks(counts, half),
@@ -334,6 +338,11 @@ def _by_frames(row_frame: np.ndarray) -> float:
 
 def _banding(row_frame: np.ndarray, column_frame: np.ndarray) -> dict[str, Banding]:
     found = {"row": banding_of(row_frame), "column": banding_of(column_frame)}
+    return {axis: one for axis, one in found.items() if one is not None}
+
+
+def _tilts(row_frame: np.ndarray, column_frame: np.ndarray) -> dict[str, Tilt]:
+    found = {"row": tilt_of(row_frame), "column": tilt_of(column_frame)}
     return {axis: one for axis, one in found.items() if one is not None}
 
 
