@@ -58,9 +58,11 @@ def signals(key, light, shape, effects, capture, shared: Shared | None = None, *
         if not isinstance(drawn, jax.Array):
             raise ValueError(f"{effect.name}: its sample returned a {type(drawn).__name__}, expected one array.")
         if np.shape(drawn) != whole:
-            raise ValueError(f"{effect.name}: its sample returned shape {np.shape(drawn)}, expected {whole}.")
-        if jnp.iscomplexobj(drawn):
-            raise ValueError(f"{effect.name}: its sample returned complex numbers, expected real ones.")
+            got = np.shape(drawn)[len(whole) - len(shape) :]
+            raise ValueError(f"{effect.name}: its sample returned shape {got}, expected {shape}.")
+        if jnp.iscomplexobj(drawn) or drawn.dtype == bool:
+            kind = "booleans" if drawn.dtype == bool else "complex numbers"
+            raise ValueError(f"{effect.name}: its sample returned {kind}, expected real numbers.")
         if jnp.issubdtype(drawn.dtype, jnp.integer) and effect.acts_at < Stage.DIGITAL:
             drawn = drawn.astype(jnp.result_type(light, jnp.float32))  # whole electrons; the next effects expect floats
         signal = drawn

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import hsnoise
+from hsnoise.simulation.draws import draw_capture
 
 CAMERA = hsnoise.cameras.grasshopper3(black_level_dn=64)
 COUNTS = np.asarray(hsnoise.sample_dark(jax.random.key(0), 8, (32, 48), CAMERA)).reshape(2, 4, 32, 48)
@@ -52,6 +53,7 @@ FAULTS = {
     "one frame": (lambda signal: signal[0], r"my_effect: .* returned shape \(32, 48\)"),
     "two": (lambda signal: (signal, signal), "my_effect: .* returned a tuple, expected one array"),
     "nothing": (lambda signal: None, "my_effect: .* returned None, .* is a return missing"),
+    "boolean": (lambda signal: signal > 1.0, "my_effect: .* returned booleans, expected real numbers"),
     "complex": (lambda signal: signal + 1j, "my_effect: .* complex numbers"),
     "nan": (lambda signal: jnp.sqrt(signal - 4.0), "my_effect: .* NaN or infinity in .* % of the pixels"),
     "infinity": (lambda signal: signal.at[:, 3].divide(0.0), "my_effect: .* NaN or infinity"),
@@ -76,6 +78,12 @@ def test_wrong_effect_is_named(call, fault):
 def test_sample_names_effect_of_wrong_shape():
     with pytest.raises(ValueError, match="my_effect: .* returned shape"):
         hsnoise.sample_dark(jax.random.key(1), 2, (32, 48), CAMERA.add(Mine(FAULTS["shape"][0])))
+
+
+def test_a_wrong_shape_is_told_without_the_axis_of_exposures():
+    like = hsnoise.FrameStack([*COUNTS, COUNTS[1]], **{**CAPTURE, "exposure_s": [0.03, 0.06, 0.09]})
+    with pytest.raises(ValueError, match=r"my_effect: .* returned shape \(4, 31, 48\), expected \(4, 32, 48\)"):
+        draw_capture(1, CAMERA.add(Mine(FAULTS["shape"][0])), like)
 
 
 def test_fault_in_the_code_of_an_effect_is_told_with_its_name():

@@ -186,7 +186,7 @@ def _lit(darks: Sequence[GroupFacts]) -> Iterator[str]:
         if signal > max(50.0, 3 * noise) and group.hot_dn - first.hot_dn < ALIKE * signal:
             yield (
                 f"The {group.name} lie {signal:.0f} DN above the {first.name}, and their pixels hardly differ:"
-                " light got in, or they are flats"
+                " light got in, they are flats, or all pixels have the same dark current"
             )
 
 
