@@ -73,6 +73,8 @@ def gain_of_flats(dark: NoiseBudget | None, lit: NoiseBudget | None, facts: Fact
     low = [one for one in levels if LOW_SIGNAL[0] * brightest < one.signal_dn < LOW_SIGNAL[1] * brightest] or levels[:1]
     bright = min(levels, key=lambda one: abs(one.signal_dn - BRIGHT * brightest))
     source = f"{len(low)} level{'s' if len(low) > 1 else ''} of {source}"
+    if len(low) < len(levels):
+        source = f"{source} (the dim ones of {len(levels)})"
     return Gain(float(np.median([one.gain for one in low])), source, bright.gain)
 
 
