@@ -67,7 +67,7 @@ OUTCOMES = {
     Status.LINE_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); the line fit was used instead",
     Status.TRANSFER: "{}",
     Status.TRANSFER_INSTEAD: "MAXIMUM LIKELIHOOD DID NOT CONVERGE ({}); pixel transfer used instead",
-    Status.CONTRADICTED: "THE LIKELIHOOD'S GAIN, {}, DISAGREES WITH PIXELS OVER TIME; pixel transfer used instead",
+    Status.CONTRADICTED: "each pixel over time; a likelihood of pooled pixels gives another gain, {}",
     Status.NEARER: "each pixel over time, because pooled pixels leave an error of {}",
     Status.MET: "simulated statistics met: {}",
     Status.NOT_MET: "NOT CONVERGED: simulated statistics not met: {}",
