@@ -50,6 +50,7 @@ from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
 from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, shared_of, with_parity
+from hsnoise.fitting.pixel_tilt import tilted_in
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of
@@ -106,6 +107,7 @@ def followed(found: Survey) -> set[str]:
     """Names of the effects beyond the paper's that a fit of these frames measures when it follows each pixel."""
     few = len(found.repeated_flats) < FEWEST_LEVELS
     unseen = {ElectronMultiplication: not has_register(found), Nonlinearity: few, BrighterFatter: few}
+    unseen[FrameTilt] = tilted_in(found) is None
     return {effect.name for effect in OF_PIXELS if not unseen.get(effect)}
 
 
