@@ -39,7 +39,8 @@ def tilted_in(found: Survey) -> Tilted | None:
 
 def _along(found: Survey, axis: str) -> Tilted | None:
     planes = [plane for group in found.repeated_darks for plane in group.planes if axis in plane.tilts]
-    share = share_of_a_line([plane.tilts[axis] for plane in planes]) if planes else 0.0
+    alike = len(found.groups[0].planes)
+    share = share_of_a_line([plane.tilts[axis] for plane in planes], alike) if planes else 0.0
     if share == 0:
         return None
     sizes = []

@@ -61,13 +61,14 @@ def tilt_of(means_dn: np.ndarray) -> Tilt | None:
     return Tilt(unbiased * float(np.mean(slopes**2)) - noise_dn2, noise_dn2, frames, lines, power, together, error)
 
 
-def share_of_a_line(planes: Sequence[Tilt]) -> float:
+def share_of_a_line(planes: Sequence[Tilt], alike: int = 1) -> float:
     """The part of the variance of slopes that a line makes which is new in each frame; 0 where slow noise may make all.
 
     Slow noise, of power k^-exponent on a white floor, has more than the lowest cosine (a likelihood ratio of mean
-    squares: Whittle, J. R. Stat. Soc. B 19, 1957). planes: of all colours and exposures.
+    squares: Whittle, J. R. Stat. Soc. B 19, 1957). planes: of all colours and exposures; alike: planes of a frame,
+    which may share all of it.
     """
-    freedom = np.array([one.frames - 1.0 for one in planes])
+    freedom = np.array([(one.frames - 1.0) / alike for one in planes])
     slope, noise, *power = np.average([(one.slope_dn2, one.noise_dn2, *one.power) for one in planes], 0, freedom)
     if slope < SURE * noise * np.sqrt(2 / freedom.sum()) or min(power) <= 0:
         return 0.0
