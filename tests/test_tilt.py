@@ -59,12 +59,12 @@ def test_too_few_frames_or_lines_tell_nothing(rng):
     assert share_of_a_line([tilt_of(np.zeros((8, LINES)))]) == 0
 
 
-def capture(rng, axis: str, slope_e: float, rows_e: float, exposure_s=(1.0, 30.0, 120.0), shape=(LINES, 200)):
+def capture(rng, axis: str, slope_e: float, rows_e: float, exponent=1.0, exposure_s=(1.0, 30.0, 120.0)):
     """A capture, and the rms of the slopes that its frames happen to have about those of their exposure."""
-    counts, squares = [], []
+    counts, squares, shape = [], [], (LINES, 200)
     for t in exposure_s:
         electrons = rng.poisson(0.5 * t, (8, *shape)) + 6 * rng.standard_normal((8, *shape))
-        electrons += slow_noise(rng, 8, 1.0, rows_e)[:, :, None]
+        electrons += slow_noise(rng, 8, exponent, rows_e)[:, :, None]
         x = np.linspace(-0.5, 0.5, shape[axis == "column"])
         slopes = slope_e * rng.standard_normal((8, 1, 1))
         squares.append(slopes.var(ddof=1))
@@ -91,9 +91,11 @@ def test_a_fit_measures_a_tilt_and_what_is_left_without_it(axis, rows_e, rng):
     assert fit.table["gain"][0] == pytest.approx(1.5, abs=4 * fit.table["gain"][1])
 
 
-def test_slow_noise_of_rows_stays_row_noise(rng):
-    fit = hsnoise.fit(capture(rng, "row", 0.0, 1.0)[0], pixels="differ")
-    assert "row_noise" in fit.added and "frame_tilt" not in fit.added
+@pytest.mark.parametrize("exponent", [1.0, 2.5])
+def test_slow_noise_of_rows_stays_row_noise(exponent, rng):
+    """What is left of it in the mean of a few frames is no pattern of rows."""
+    fit = hsnoise.fit(capture(rng, "row", 0.0, 1.5, exponent)[0], pixels="differ")
+    assert set(fit.added) <= {"row_noise", "frame_offset"} and "row_noise" in fit.added
 
 
 @pytest.mark.parametrize("after_gain", [False, True])
@@ -109,7 +111,7 @@ def test_colours_tell_on_which_side_of_the_gain_it_arises(after_gain):
 
 
 def test_a_part_of_a_sensor_has_a_part_of_the_slope(rng):
-    whole, _ = capture(rng, "row", 7.0, 0.0, (1.0,))
+    whole, _ = capture(rng, "row", 7.0, 0.0, exposure_s=(1.0,))
     part = hsnoise.FrameStack([whole.counts[0][:, 40:120]], [1.0], window=(40, 0, LINES, 200))
     sizes = [float(hsnoise.fit(stack, pixels="differ").params["frame_tilt"].sigma) for stack in (whole, part)]
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
@@ -125,3 +127,14 @@ def test_a_straightened_survey_has_only_the_rest(rng):
             rest, truth = one.planes[0].components[name], other.planes[0].components[name]
             assert abs(rest.variance_dn2 - truth.variance_dn2) < 3 * truth.standard_error_dn2
             assert rest.standard_error_dn2 < 1.5 * truth.standard_error_dn2 + 1e-3
+
+
+@pytest.mark.parametrize("cfa", ["mono", "RGGB"])
+def test_colours_tell_no_more_about_offsets_of_frames_than_one(cfa, rng):
+    counts = []
+    for t in (1.0, 30.0, 120.0):
+        electrons = rng.poisson(0.5 * t, (8, 96, 128)) + 6 * rng.standard_normal((8, 96, 128))
+        counts.append(np.rint(500 + 1.5 * (electrons + 2 * rng.standard_normal((8, 1, 1)))).astype(np.uint16))
+    fit = hsnoise.fit(hsnoise.FrameStack(counts, (1.0, 30.0, 120.0), cfa=cfa), pixels="differ")
+    value, error, _ = fit.table["frame_offset.sigma"]
+    assert error / value == pytest.approx(1 / np.sqrt(2 * 7), rel=0.15)

@@ -253,7 +253,7 @@ def _channel(
         covariance=covariance,
         black_dn=black,
         row_gain=row_gain(values[2]),
-        patterns=patterns_of(found, c, shading, lines, tilted),
+        patterns=patterns_of(found, c, shading, lines, (spectrum, of_columns), tilted),
         lines=lines,
         temporal_dn2=floor,
         is_narrow=narrow is not None,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hsnoise.fitting.pixel_lines import Lines, lines_of
+from hsnoise.fitting.pixel_rows import RowSpectrum
 from hsnoise.fitting.pixel_tilt import Tilted
 from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.banding import Banding
@@ -103,9 +104,14 @@ def patterns_of(
     c: int,
     shading: Mapping[str, Shading],
     lines: Mapping[str, Lines],
-    tilted: Tilted | None = None,
+    spectra: tuple[RowSpectrum, RowSpectrum],
+    tilted: Tilted | None,
 ) -> dict[str, tuple[float, float, float]]:
-    """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it."""
+    """Variance that frames, rows and columns share at the shortest exposure, by the effect that draws it.
+
+    spectra: of what rows and columns share in a frame: where they resemble each other, by a power law that is known,
+    their mean over frames scatters more.
+    """
     planes, out = shortest_of(found, c), {}
     if not planes:
         return out
@@ -119,20 +125,24 @@ def patterns_of(
         scatter = {"row_x_frame": groups.variance_dn2[1], "frame": known["frame"] * np.sqrt(2 / (frames - 1))}
         of_mean_dn2 = groups.of_rows_dn2(mono=mono) / frames
         scatter["row"] = of_mean_dn2 * np.sqrt(2 * groups.rows / found.shape[0])  # fewer groups than rows
+    of_axes = zip(AXES, spectra, strict=True)
+    wider = {axis: of.widened for axis, of in of_axes if np.isfinite(of.exponent[1])}
     for component, effect in PATTERNS.items():
         shared = mean_of([plane.components[component] for plane in planes])
         of = lines.get(component)
         if of is not None and (component in shading or of.far or of.parity_dn is not None):
             shared = replace(shared, variance_dn2=of.variance_dn2, standard_error_dn2=of.error_dn2)
-        if component == "frame" and (course := found.settling) is not None:
-            shared = _about(course, shared, planes)
+        if component == "frame":  # which all planes share
+            shared = replace(shared, standard_error_dn2=shared.standard_error_dn2 * float(np.sqrt(len(planes))))
+            shared = shared if found.settling is None else _about(found.settling, shared, planes)
+        chance = shared.chance_dn2 * wider.get(component, 1.0)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
         of_mean += _of_tilts(tilted, component, c)
         out[effect] = (
             shared.variance_dn2 - known.get(component, 0.0),
             float(np.hypot(shared.standard_error_dn2, scatter.get(component, 0.0))),
-            float(np.hypot(shared.chance_dn2, max(of_mean, scatter.get(component, 0.0)))),
+            float(np.hypot(chance, max(of_mean, scatter.get(component, 0.0)))),
         )
     return out
 

@@ -59,7 +59,7 @@ def shared_patterns(channels: Sequence[Channel], gain: np.ndarray, cfa: str) -> 
         scale = np.full(len(gain), gain[cfa_tile(cfa)].mean()) if after else gain
         mean = float(np.mean(variance / scale**2))
         if mean > max(PATTERN_THERE * _error_of_mean(chance / scale**2), LEAST_PATTERN * noise):
-            of_sigma = _error_of_mean(error / scale**2) / (2 * np.sqrt(mean))
+            of_sigma = _error_of_common(error / scale**2, name) / (2 * np.sqrt(mean))
             found[name] = Shared((float(np.sqrt(mean)), of_sigma), after)
     return found
 
@@ -170,6 +170,13 @@ def _off_by(values: np.ndarray, errors: np.ndarray, shape: np.ndarray) -> float:
     """Chi2 of values of that shape, of any size."""
     shape, values = shape / errors, values / errors
     return float(((values - shape * (shape @ values) / (shape @ shape)) ** 2).sum())
+
+
+def _error_of_common(errors: np.ndarray, pattern: str) -> float:
+    """Of the mean over colours, which share all frames, and each row or column with another."""
+    if len(errors) == 1 or pattern == PATTERNS["frame"]:
+        return float(errors.mean())
+    return float(np.sqrt(2)) * _error_of_mean(errors)
 
 
 def _error_of_mean(errors: np.ndarray) -> float:
