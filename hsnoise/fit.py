@@ -119,10 +119,11 @@ def fit(
     measurable = found is not None and (model is None or "black_clamp" not in model)
     differ = measurable and _is_conditional(found, method, pixels)
     seen = None
-    if measurable and not differ and pixels == "auto" and any(name in followed(found) for name in extra):
+    of_pixels = followed(found) if measurable and extra else set()
+    if measurable and not differ and pixels == "auto" and not of_pixels.isdisjoint(extra):
         seen = Evidence(found, _summary_of(source, progress))
         differ = carries_no_gain(seen, method)  # what single pixels tell is not to be simulated
-    simulated = tuple(name for name in extra if not (differ and name in followed(found)))
+    simulated = tuple(name for name in extra if not (differ and name in of_pixels))
     if simulated:
         result = replace(_with_effects(source, model, simulated, method, pixels, progress), stack=source)
         return _ended(result if found is None else checked(result, Evidence(found, result.summary)))
