@@ -233,7 +233,8 @@ def _channel(
     if found.row_groups is not None:
         apart, error = found.row_groups.of_pixels_dn2(mono=found.cfa == "mono")
         values[1], covariance[1, 1] = values[1] - apart, covariance[1, 1] + error**2
-    shading = shadings_of(found, c, (spectrum.widened, of_columns.widened), tilted)
+    spectra = spectrum, of_columns
+    shading = shadings_of(found, c, spectra, tilted)
     lines = lines_in(found, c, shading)
     offset = offset_of(found, c, population)
     warm = warm_in(found, c) if is_plain and not found.has_exposures else None
@@ -253,7 +254,7 @@ def _channel(
         covariance=covariance,
         black_dn=black,
         row_gain=row_gain(values[2]),
-        patterns=patterns_of(found, c, shading, lines, (spectrum, of_columns), tilted),
+        patterns=patterns_of(found, c, shading, lines, spectra, tilted),
         lines=lines,
         temporal_dn2=floor,
         is_narrow=narrow is not None,

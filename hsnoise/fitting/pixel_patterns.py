@@ -9,7 +9,7 @@ import numpy as np
 
 from hsnoise.fitting.pixel_lines import Lines, lines_of
 from hsnoise.fitting.pixel_rows import RowSpectrum
-from hsnoise.fitting.pixel_tilt import Tilted
+from hsnoise.fitting.pixel_tilt import AXES, Tilted
 from hsnoise.statistics.decomposition import Component, mean_of
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.settling import Settling
@@ -17,7 +17,6 @@ from hsnoise.statistics.pixels.shading import Shading, shading_of
 from hsnoise.statistics.pixels.survey import Plane, Survey
 
 ALTERNATING = 0.45  # cycles per row
-AXES = ("row", "column")
 CERTAIN = 10.0  # standard errors of a drift
 PATTERNS = {
     "frame": "frame_offset",
@@ -61,11 +60,11 @@ def known_of_columns(found: Survey, c: int) -> float:
 
 
 def shadings_of(
-    found: Survey, c: int, widened: tuple[float, float] = (1.0, 1.0), tilted: Tilted | None = None
+    found: Survey, c: int, spectra: tuple[RowSpectrum, RowSpectrum], tilted: Tilted | None
 ) -> dict[str, Shading]:
     """The drift of the black level along the rows or down the frame: a model has one.
 
-    widened: as in `RowSpectrum`, of rows and of columns; slow noise drifts, too, and few frames do not average it out.
+    spectra: of what rows and columns share in a frame; slow noise drifts, too, and few frames do not average it out.
     Nor do they average out what frames are tilted by.
     """
     planes, out = shortest_of(found, c), {}
@@ -75,7 +74,7 @@ def shadings_of(
             means = np.mean([getattr(p, name) for p in planes], axis=0)
             of_lines_dn2 = mean_of([p.components[f"{axis}_x_frame"] for p in planes]).variance_dn2
             # In the shape of a shading: all of it, if a few slow waves make the noise.
-            slow = min(2 * widened[AXES.index(axis)] ** 2 / len(means), 1.0)
+            slow = min(2 * spectra[AXES.index(axis)].widened ** 2 / len(means), 1.0)
             chance = np.sqrt(max(of_lines_dn2, 0.0) / found.shortest.n_frames * slow)
             chance = np.hypot(chance, np.sqrt(_of_tilts(tilted, axis, c)))
             one = shading_of(means, float(noise), float(chance))

@@ -46,11 +46,11 @@ from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_most, rays_of, wa
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, bends_of, of_colours
 from hsnoise.fitting.pixel_joint import ROW_GAIN_THERE, UNKNOWN
-from hsnoise.fitting.pixel_patterns import AXES, PATTERNS
+from hsnoise.fitting.pixel_patterns import PATTERNS
 from hsnoise.fitting.pixel_register import effects_of, has_register
 from hsnoise.fitting.pixel_response import FEWEST_LEVELS
 from hsnoise.fitting.pixel_shared import Shared, of_glow, of_settling, of_taps, shared_of, with_parity
-from hsnoise.fitting.pixel_tilt import tilted_in
+from hsnoise.fitting.pixel_tilt import AXES, tilted_in
 from hsnoise.fitting.result import FitResult, Method, Status
 from hsnoise.likelihood.moments import model_of
 from hsnoise.likelihood.parameters import numbers_of

@@ -10,7 +10,7 @@ import numpy as np
 from hsnoise._core.types import cfa_tile
 from hsnoise.fitting.pixel_lines import Lines
 from hsnoise.fitting.pixel_patterns import PATTERNS
-from hsnoise.fitting.pixel_tilt import Tilted
+from hsnoise.fitting.pixel_tilt import AXES, Tilted
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.pixels.glow import Glow
 from hsnoise.statistics.pixels.settling import Settling
@@ -78,7 +78,7 @@ def shared_of(
 
 def slopes_of(tilted: Tilted, gain: np.ndarray, stack: FrameStack) -> Shared:
     """Slopes of the frames, from end to end of the sensor, of which they may be a part."""
-    i = ("row", "column").index(tilted.axis)
+    i = AXES.index(tilted.axis)
     longer = 1.0 if stack.window is None else (stack.window[2 + i] - 1) / (stack.shape[i] - 1)
     after = is_after_gain(tilted.seen_dn2[:, 0], tilted.seen_dn2[:, 1], gain)
     scale = np.full(len(gain), gain[cfa_tile(stack.cfa)].mean()) if after else gain
