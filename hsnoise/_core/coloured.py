@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are used
 
+from hsnoise._core.poisson import normal_of_bits, pixel_words
 from hsnoise._core.types import RandomKey, Scalar
 
 EXPONENTS = (-2.0, 3.0)  # of a series by its correlation
@@ -131,8 +132,13 @@ def power_of_ringing(n: int, frequency: Scalar, memory: Scalar) -> jax.Array:
 
 def coloured_normal(key: RandomKey, shape: tuple[int, int, int], power: jax.Array, dtype: jnp.dtype) -> jax.Array:
     """Stationary periodic normal series along axis 1 of `shape`, with independent bins of mean `power` [shape[1]]."""
-    white = jax.random.normal(key, shape, dtype)
-    half = power[: shape[1] // 2 + 1]
+    series, n, channels = shape
+    bins = n // 2 + 1
+    frequency = jnp.arange(bins)
+    # All bins but those of no and of half a cycle have a real and an imaginary part of half their power.
+    parts = jnp.where((frequency == 0) | (2 * frequency == n), n, n / 2)
+    half = power[:bins] * parts.astype(power.dtype)
     # The square root of a zero power has a NaN gradient.
-    amplitude = jnp.where(half > 0, jnp.sqrt(jnp.where(half > 0, half, 1.0)), 0.0)
-    return jnp.fft.irfft(jnp.fft.rfft(white, axis=1) * amplitude[None, :, None], n=shape[1], axis=1)
+    amplitude = jnp.where(half > 0, jnp.sqrt(jnp.where(half > 0, half, 1.0)), 0.0).astype(dtype)[None, :, None]
+    real, imaginary = (normal_of_bits(word).astype(dtype) for word in pixel_words(key, (series, bins, channels)))
+    return jnp.fft.irfft(jax.lax.complex(real * amplitude, imaginary * amplitude), n=n, axis=1)

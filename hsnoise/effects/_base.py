@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hsnoise._core.keys import named_key
-from hsnoise._core.poisson import normal_of_bits, pixel_words, poisson_of_bits
+from hsnoise._core.poisson import pixel_words, poisson_of_bits
 from hsnoise._core.types import (
     Counts,
     FrameRows,
@@ -374,19 +374,13 @@ def draw_poisson(key: RandomKey, mean: jax.Array, shape: tuple[int, ...]) -> Fra
 
     Counts are whole numbers, so a draw has no derivative with respect to its mean.
     """
-    bits = jax.random.bits(key, shape, jnp.uint32)
-    return poisson_of_bits(bits, jax.lax.stop_gradient(mean)).astype(mean.dtype)
+    first, _ = pixel_words(key, shape)
+    return poisson_of_bits(first, jax.lax.stop_gradient(mean)).astype(mean.dtype)
 
 
 def electrons_of_pixels(key: RandomKey, mean: Frames) -> Frames:
     """Poisson counts given the means of all pixels, from the first word of each pixel; no derivative, as above."""
-    first, _ = pixel_words(key, mean.shape)
-    return poisson_of_bits(first, jax.lax.stop_gradient(mean)).astype(mean.dtype)
-
-
-def normal_of_pixels(key: RandomKey, like: Frames) -> Frames:
-    """Standard normal numbers from the second word of each pixel."""
-    return normal_of_bits(pixel_words(key, like.shape)[1]).astype(like.dtype)
+    return draw_poisson(key, mean, mean.shape)
 
 
 def step_from_previous(signal: Frames) -> Frames:

@@ -16,6 +16,7 @@ from hsnoise.effects._facts import CaptureFacts, Maker
 from hsnoise.effects._parameters import param
 
 MOST_CODES = 1 << 16  # of a converter
+FEW_CODES = 32  # from 64 on XLA does not vectorise it
 LARGEST = 1e6  # error of a pattern, which may have any unit
 NARROWEST_DN = 1.2  # of noise over whose codes a pattern shows
 
@@ -72,7 +73,9 @@ class AdcNonuniformity(AbstractEffect):
         ends = jnp.cumsum(self._widths(capture, signal.dtype))
         above = signal + 0.5 + jnp.mean(ends - jnp.arange(1, self.period + 1))  # where code 0 begins
         within = jnp.mod(above, self.period)
-        code = jnp.round(above - within) + jnp.searchsorted(ends[:-1], within, side="right")
+        # Few codes are faster compared one by one than found by halves.
+        method = "compare_all" if self.period <= FEW_CODES else "scan"
+        code = jnp.round(above - within) + jnp.searchsorted(ends[:-1], within, side="right", method=method)
         # By so many codes it is read wrongly; what rounds and clips is the converter itself.
         return signal + (code - jnp.floor(signal + 0.5)).astype(signal.dtype)
 

@@ -7,7 +7,8 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from hsnoise._core.gamma import gamma
+from hsnoise._core.gamma import log_gamma_of_pixels
+from hsnoise._core.poisson import normal_of_pixels
 from hsnoise._core.types import Frames, PixelMap, RandomKey, Scalar, is_traced
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
@@ -63,15 +64,15 @@ class DarkCurrentNonuniformity(AbstractEffect):
         shape = (1, *shape[1:])
 
         def log_normal():
-            return jnp.exp(self.spread * jax.random.normal(key, shape) - self.spread**2 / 2)
+            return jnp.exp(self.spread * normal_of_pixels(key, shape) - self.spread**2 / 2)
 
         return jax.lax.cond(jnp.abs(self.skew) < AS_NORMAL, log_normal, lambda: self._skewed(key, shape))
 
     def _skewed(self, key: RandomKey, shape: tuple[int, ...]) -> PixelMap:
         skew = jnp.where(jnp.abs(self.skew) < AS_NORMAL, 1.0, self.skew)
         k, power = skew**-2, -self.spread / skew
-        drawn = jnp.maximum(gamma(jax.random.fold_in(key, SKEWED), jnp.full(shape, k)), LEAST_GAMMA)
-        return jnp.exp(power * jnp.log(drawn / k) - _log_mean(k, power))
+        drawn = log_gamma_of_pixels(jax.random.fold_in(key, SKEWED), k, shape)
+        return jnp.exp(power * drawn - _log_mean(k, power))
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
         """The signal unchanged: the effect that draws the dark current applies the scale."""

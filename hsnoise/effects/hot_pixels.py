@@ -62,7 +62,7 @@ class HotPixels(AbstractEffect):
         hot = uniform_of_bits(pixel_words(where, (1, *signal.shape[1:]))[0]).ravel() <= self.fraction
         so_far = jnp.cumsum(hot.astype(jnp.int32))
         charge = jax.lax.stop_gradient(self.rate * capture.exposure_s + self.at_readout)
-        number = jnp.where(charge > 0, so_far[-1], 0)
+        number = so_far[-1]  # without charge, too: a number of its own for each exposure makes loops over them slow
         piece = min(pixels, max(pixels // PIECES, LEAST_PIECE))
         frame = jax.lax.broadcasted_iota(jnp.uint32, (frames, piece), 0)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.poisson import pixel_words
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured, param
@@ -85,7 +86,7 @@ class MeasuredDistribution(AbstractEffect):
         return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)
 
     def _draw(self, key: RandomKey, like: Frames) -> Frames:
-        bits = jax.random.bits(key, like.shape, jnp.uint32)
+        bits, _ = pixel_words(key, like.shape)
         odds = [jnp.log(b.astype(like.dtype) + 0.5) for b in (bits, ~bits)]
         last = len(self.quantiles) - 1
         place = jnp.clip((odds[0] - odds[1]) / (2 * LARGEST_LOGIT) + 0.5, 0, 1) * last

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.poisson import pixel_words, uniform_of_bits
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured, param
@@ -44,12 +45,10 @@ class MeasuredHits(AbstractEffect):
             raise ValueError("measured_hits.amplitude: expected two quantiles or more that do not fall.")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        where, how_much = jax.random.split(key)
+        where, place = (uniform_of_bits(word).astype(signal.dtype) for word in pixel_words(key, signal.shape))
         probability = jnp.minimum(self.chance + self.rate * capture.exposure_s, 1)
-        is_hit = jax.random.uniform(where, signal.shape, signal.dtype) < probability
-        place = jax.random.uniform(how_much, signal.shape, signal.dtype)
         amplitude = jnp.interp(place, jnp.linspace(0, 1, len(self.amplitude), dtype=signal.dtype), self.amplitude)
-        return signal + jnp.where(is_hit, amplitude, 0)
+        return signal + jnp.where(where <= probability, amplitude, 0)
 
     def components(self, capture: Capture) -> dict[str, float]:
         probability = min(float(self.chance + self.rate * capture.exposure_s), 1.0)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hsnoise._core.poisson import normal_of_pixels
 from hsnoise._core.types import Frames, PixelMap, RandomKey, cfa_tile
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import MOST_LINES, is_whole, measured
@@ -90,7 +91,7 @@ class MeasuredMap(AbstractEffect):
         mean = self._part(self.dark_current, capture)
         if self.dark_fluctuation is None:
             return mean
-        change = self._part(self.dark_fluctuation, capture) * jax.random.normal(key, shape, mean.dtype)
+        change = self._part(self.dark_fluctuation, capture) * normal_of_pixels(key, shape, mean.dtype)
         return mean * jnp.maximum(1 + change, 0)
 
     def light_scale(self, capture: Capture, shape: tuple[int, ...], *, key: RandomKey) -> PixelMap | None:

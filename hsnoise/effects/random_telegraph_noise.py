@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from scipy.special import gamma
 
+from hsnoise._core.poisson import uniform_of_pixels
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
@@ -71,7 +72,7 @@ class RandomTelegraphNoise(AbstractEffect):
         return signal + jnp.where(where < self.fraction, jump * change, 0)
 
     def _is_high(self, key: RandomKey, signal: Frames) -> Frames:
-        return (jax.random.uniform(key, signal.shape, signal.dtype) < self.duty).astype(signal.dtype)
+        return (uniform_of_pixels(key, signal.shape, signal.dtype) <= self.duty).astype(signal.dtype)
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from hsnoise._core.poisson import normal_of_pixels
 from hsnoise._core.types import Frames, RandomKey, Scalar
-from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, normal_of_pixels
+from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import param
 
 
@@ -26,7 +27,7 @@ class ReadNoise(AbstractEffect):
     sigma: Scalar = param("e-", low=0, amplitude=True, doc="standard deviation of the read noise")
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        noise = self.sigma * normal_of_pixels(key, signal)
+        noise = self.sigma * normal_of_pixels(key, signal.shape, signal.dtype)
         return signal + (noise if capture.read_noise_scale is None else noise * capture.read_noise_scale)
 
     def components(self, capture: Capture) -> dict[str, float]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 
+from hsnoise._core.poisson import normal_of_pixels, uniform_of_pixels
 from hsnoise._core.types import Frames, PixelMap, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._facts import CaptureFacts, Maker
@@ -58,9 +58,9 @@ class ReadNoiseNonuniformity(AbstractEffect):
         spreads[".columns"] = (self.column_spread, 1, columns)
         logarithm = jnp.zeros((1, 1, 1))
         for part, (spread, *of) in spreads.items():
-            z = jax.random.normal(capture.fixed_key(self.name + part), (1, *of))
+            z = normal_of_pixels(capture.fixed_key(self.name + part), (1, *of))
             logarithm = logarithm + spread * z - spread**2
-        tail = jax.random.exponential(capture.fixed_key(self.name + ".tail"), (1, rows, columns))
+        tail = -jnp.log(uniform_of_pixels(capture.fixed_key(self.name + ".tail"), (1, rows, columns)))
         return jnp.exp(logarithm + self.tail * tail) * jnp.sqrt(1 - 2 * self.tail)
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
