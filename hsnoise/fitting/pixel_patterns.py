@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import scipy  # its parts are imported when they are used
 
 from hsnoise.fitting.pixel_lines import Lines, lines_of
 from hsnoise.fitting.pixel_rows import RowSpectrum
@@ -18,6 +19,7 @@ from hsnoise.statistics.pixels.survey import Plane, Survey
 
 ALTERNATING = 0.45  # cycles per row
 CERTAIN = 10.0  # standard errors of a drift
+LEAST_P = 0.01  # that frames of several exposures differ alike
 PATTERNS = {
     "frame": "frame_offset",
     "row": "row_fixed_pattern",
@@ -131,9 +133,8 @@ def patterns_of(
         of = lines.get(component)
         if of is not None and (component in shading or of.far or of.parity_dn is not None):
             shared = replace(shared, variance_dn2=of.variance_dn2, standard_error_dn2=of.error_dn2)
-        if component == "frame":  # which all planes share
-            shared = replace(shared, standard_error_dn2=shared.standard_error_dn2 * float(np.sqrt(len(planes))))
-            shared = shared if found.settling is None else _about(found.settling, shared, planes)
+        if component == "frame":
+            shared = _of_frames(found, c) if found.settling is None else _about(found.settling, shared, planes)
         chance = shared.chance_dn2 * wider.get(component, 1.0)
         # A sinusoid of random phases leaves a mean that scatters as a whole, not line by line.
         of_mean = waves[component].variance_dn2 / found.shortest.n_frames if waves.get(component) else 0.0
@@ -149,6 +150,32 @@ def patterns_of(
 def _of_tilts(tilted: Tilted | None, axis: str, c: int) -> float:
     """Variance of static rows or columns that the frames' tilts leave, DN^2."""
     return 0.0 if tilted is None or tilted.axis != axis else float(tilted.of_mean_dn2[c])
+
+
+def _of_frames(found: Survey, c: int) -> Component:
+    """The component of frames: of all repeated darks if these agree, or else of the shortest."""
+    groups = found.repeated_darks
+    dof = np.array([group.n_frames - 1.0 for group in groups])
+    parts = [mean_of([plane.components["frame"] for plane in group.of(c)]) for group in groups]
+    # Offsets of frames are shared by all planes.
+    planes = float(np.sqrt(len(groups[0].of(c))))
+    error = np.array([planes * part.standard_error_dn2 for part in parts])
+    if not _alike(error * np.sqrt(dof / 2), dof):
+        i = next(i for i, group in enumerate(groups) if group is found.shortest)
+        return replace(parts[i], standard_error_dn2=float(error[i]))
+    variance, chance = (np.array([getattr(part, name) for part in parts]) for name in ("variance_dn2", "chance_dn2"))
+    weight = dof / dof.sum()
+    of_error, of_chance = (float(np.linalg.norm(weight * each)) for each in (error, chance))
+    return Component(float(weight @ variance), of_error, chance_dn2=of_chance)
+
+
+def _alike(variance: np.ndarray, dof: np.ndarray) -> bool:
+    """Whether normal samples have one variance (Bartlett, Proc. R. Soc. A 160, 1937)."""
+    if len(dof) == 1 or (variance <= 0).any():
+        return len(dof) == 1
+    total, others = dof.sum(), len(dof) - 1
+    apart = total * np.log(dof @ variance / total) - dof @ np.log(variance)
+    return bool(scipy.special.chdtrc(others, apart / (1 + ((1 / dof).sum() - 1 / total) / (3 * others))) > LEAST_P)
 
 
 def _about(course: Settling, frame: Component, planes: list[Plane]) -> Component:
