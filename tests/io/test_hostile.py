@@ -102,6 +102,15 @@ def test_frames_of_zeros_that_pack_well_are_no_unwritten_file(tmp_path):
     assert hsnoise.load(tmp_path / "a.h5").n_frames == (400,)
 
 
+def test_a_truncated_npy_is_told_with_its_sizes(tmp_path):
+    np.save(tmp_path / "a.npy", counts())
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(data[:-1])
+    declared = counts().nbytes
+    with pytest.raises(ValueError, match=f"a.npy: its header declares {declared} bytes, and it holds {declared - 1}"):
+        hsnoise.load(tmp_path / "a.npy", exposure_s=1)
+
+
 def test_archives_and_objects_that_are_called_npy(tmp_path):
     np.savez(tmp_path / "a.npz", counts=counts())
     archive, objects = tmp_path / "a.npy", tmp_path / "b.npy"

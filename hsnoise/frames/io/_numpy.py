@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -30,12 +30,7 @@ def read(path: Path) -> list[Recording]:
     """
     with naming(path):
         if path.suffix.lower() == ".npy":
-            found = np.load(path, mmap_mode="r")
-            if not isinstance(found, np.ndarray):
-                found.close()
-                raise ValueError("it is an archive of several arrays; give it the suffix .npz")
-            _check_end(found.nbytes, path.stat().st_size - found.offset)
-            return recordings(path, _groups(found), {})
+            return recordings(path, _groups(_mapped(path)), {})
         if not zipfile.is_zipfile(path):
             raise ValueError("it is not an .npz file, or it is truncated")
         with zipfile.ZipFile(path) as archive:
@@ -45,6 +40,17 @@ def read(path: Path) -> list[Recording]:
             if "counts" not in names:
                 raise ValueError(f"expected an array 'counts', got {sorted(names)}")
             return recordings(path, _groups(array("counts")), {name: array(name) for name in METADATA if name in names})
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """The array of an .npy file, memory-mapped. Raises ValueError if its header declares another size than it holds."""
+    if zipfile.is_zipfile(path):
+        raise ValueError("it is an archive of several arrays; give it the suffix .npz")
+    with path.open("rb") as file:
+        declared, dtype = _declared(file)
+        if not dtype.hasobject:
+            _check_end(declared, path.stat().st_size - file.tell())
+    return np.load(path, mmap_mode="r")
 
 
 def _names(archive: zipfile.ZipFile) -> list[str]:
@@ -62,16 +68,21 @@ def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     """An array of an .npz file. Raises ValueError if its header declares another size than the file holds."""
     member = archive.getinfo(f"{name}.npy")
     with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in HEADERS:
-            raise ValueError(f"{name}: expected an array of numbers, got one with names of fields")
-        shape, _, dtype = HEADERS[version](file)
-        declared = math.prod(shape) * dtype.itemsize
+        declared, dtype = _declared(file, f"{name}: ")
         check_held(name, member.compress_size, declared)
         if not dtype.hasobject:
             _check_end(declared, member.file_size - file.tell())
         file.seek(0)
         return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _declared(file: IO[bytes], of: str = "") -> tuple[int, np.dtype]:
+    """Bytes of the array that its header declares, and their type; `of`: the array, for the error."""
+    version = np.lib.format.read_magic(file)
+    if version not in HEADERS:
+        raise ValueError(f"{of}expected an array of numbers, got one with names of fields")
+    shape, _, dtype = HEADERS[version](file)
+    return math.prod(shape) * dtype.itemsize, dtype
 
 
 def _check_end(declared: int, held: int) -> None:
