@@ -30,6 +30,7 @@ from hsnoise.criticism.outcomes import (
     has_sides,
     on_side,
     side_of,
+    side_shows,
 )
 from hsnoise.criticism.ranking import Candidate
 from hsnoise.criticism.resume import read_steps
@@ -314,13 +315,14 @@ class _Work:
 
         `diagnose` judges the side from a base fit that the effect has biased: what holds is fitted on the other, too.
         """
-        found, ahead = self.fitted_with(steps, effect, f"adding {effect.name}"), float("nan")
+        found = self.fitted_with(steps, effect, f"adding {effect.name}")
+        ahead = 0.0 if has_sides(effect) else float("nan")  # in frames of one gain both sides are equally likely
         if found is None:
             return Refusal(Refused.NOT_FITTED)
         gain = self.judged(judge, steps, found, effect.name)
         if isinstance(gain, Refusal):
             return gain
-        if has_sides(effect):
+        if side_shows(effect, self.fitted.cfa):
             side = next(side for side in Side if side != side_of(effect))
             other = self.fitted_with(steps, on_side(effect, side), "the same on the other side of the gain")
             if other is not None:

@@ -102,6 +102,11 @@ def has_sides(effect: AbstractEffect) -> bool:
     return hasattr(effect, "after_gain")
 
 
+def side_shows(effect: AbstractEffect, cfa: str) -> bool:
+    """Whether frames tell the side of an effect that may arise on either: they need colours of different gains."""
+    return has_sides(effect) and cfa != "mono"
+
+
 def side_of(effect: AbstractEffect) -> Side:
     """The side of an effect; before the gain for one that has no choice."""
     return Side.AFTER if getattr(effect, "after_gain", False) else Side.BEFORE

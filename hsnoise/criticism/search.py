@@ -10,7 +10,7 @@ import numpy as np
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import given
 from hsnoise.criticism.fingerprint import DRAWN_ERROR, NEARBY_ERROR, RELATIVE_ERROR, Bench
-from hsnoise.criticism.outcomes import Side, has_sides, on_side
+from hsnoise.criticism.outcomes import Side, has_sides, on_side, side_shows
 from hsnoise.criticism.ranking import (
     CLOSE,
     LEADERS,
@@ -120,7 +120,8 @@ class Search:
         effect = first.candidate(self.evidence).effect
         if first.score <= self.evidence.least or not (has_sides(effect) or first.misfit > rules.MISFIT_LEFT):
             return judged, None
-        variants = [on_side(effect, side) for side in Side] if has_sides(effect) else [effect]
+        sides = side_shows(effect, self.bench.model.cfa)
+        variants = [on_side(effect, side) for side in Side] if sides else [effect]
         found = [with_base(one, self.bench, self.evidence) for one in variants]
         best = max(found, key=lambda one: one.score)
         closer = self.drawn_close(best.start) if has_sides(effect) else first

@@ -153,8 +153,8 @@ def open_side(effect: AbstractEffect) -> str:
     if not has_sides(effect):
         return ""
     return (
-        f"whether {effect.name} arises before or after the gain is a first guess: improve fits both and keeps the"
-        " likelier side"
+        f"whether {effect.name} arises before or after the gain is a first guess, which only colours of different gains"
+        " can correct: improve fits both and keeps the likelier side"
     )
 
 

@@ -304,13 +304,22 @@ def test_only_what_holds_is_tried_on_the_other_side(monkeypatch, scores, side):
 
     monkeypatch.setattr(_Work, "fitted_with", fitted_with)
     monkeypatch.setattr(of, "score_of_side", lambda params, portion, seed: score[params])
-    work, gain, effect = _Work(None, None, None, 0, print), Improvement(30.0, 2.0, 1), fx.RowNoise(1.0)
+    colours, gain, effect = SimpleNamespace(cfa="RGGB"), Improvement(30.0, 2.0, 1), fx.RowNoise(1.0)
+    work = _Work(colours, None, None, 0, print)
     monkeypatch.setattr(_Work, "judged", lambda *of: gain)
     fit, same, ahead = work.with_one_more([], effect, None)
     assert (fit.params, same, ahead) == (side, gain, 2.0) and fitted == list(Side)
     refusal = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1))
     monkeypatch.setattr(_Work, "judged", lambda *of: refusal)
     assert work.with_one_more([], effect, None) is refusal and len(fitted) == 3
+
+
+def test_one_gain_does_not_tell_the_side(monkeypatch):
+    monkeypatch.setattr(_Work, "fitted_with", lambda self, steps, effect, what: SimpleNamespace(params=side_of(effect)))
+    monkeypatch.setattr(_Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
+    work = _Work(SimpleNamespace(cfa="mono"), None, None, 0, print)
+    assert work.with_one_more([], fx.RowNoise(1.0), None)[::2] == (SimpleNamespace(params=Side.BEFORE), 0.0)
+    assert np.isnan(work.with_one_more([], fx.HotPixels(0.01, 100.0), None)[2])
 
 
 def draft_of(last_step):
@@ -325,7 +334,7 @@ def test_a_fit_is_finished_only_if_it_holds_so_far(monkeypatch):
     monkeypatch.setattr(_Work, "fitted_with", lambda *of: draft)
     monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: of[id(fit)])
     monkeypatch.setattr(Draft, "finished", lambda self: seen.append(self) or whole)
-    work, effect = _Work(None, None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
+    work, effect = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
     assert work.with_one_more([], effect, None) is refusal and not seen
     of[id(draft)] = gain
     assert work.with_one_more([], effect, None)[:2] == (whole, gain) and seen == [draft]
@@ -354,7 +363,7 @@ def test_the_likelier_side_of_the_gain_is_judged_and_kept(monkeypatch):
     scores = iter([5.0, 2.0, 2.0, 6.0])
     module = importlib.import_module("hsnoise.criticism.improve")
     monkeypatch.setattr(module, "score_of_side", lambda *of: next(scores))
-    work = _Work(None, None, None, 0, lambda event: None)
+    work = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None)
     assert work.with_one_more([], fx.FrameOffset(2.0), None) == (first, gain, 3.0) and judged == [first]
     assert work.with_one_more([], fx.FrameOffset(2.0), None) == (other, gain, 4.0) and judged[1:] == [first, other]
 
