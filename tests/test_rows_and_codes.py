@@ -34,7 +34,8 @@ def test_rows_of_two_banks_resemble_the_next_but_one(rng):
         found.names.index(f"row x frame: correlation with the next row{but}, short exposures")
         for but in ("", " but one")
     )
-    assert found.values[two] > 5 * found.error[two] > 5 * abs(found.values[one])
+    assert found.values[two] > 12 * found.error[two]
+    assert abs(found.values[one]) < 0.35  # scatters by 0.1: each bank varies slowly
 
 
 def test_codes_that_are_left_out_are_told_from_narrow_ones(rng):
