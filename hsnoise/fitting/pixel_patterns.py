@@ -160,7 +160,9 @@ def _of_frames(found: Survey, c: int) -> Component:
     # Offsets of frames are shared by all planes.
     planes = float(np.sqrt(len(groups[0].of(c))))
     error = np.array([planes * part.standard_error_dn2 for part in parts])
-    if not _alike(error * np.sqrt(dof / 2), dof):
+    # Counts of noise narrower than a count follow levels the less, the narrower it is: longer darks are others.
+    is_narrow = any(plane.narrow_dn is not None for group in groups for plane in group.of(c))
+    if is_narrow or not _alike(error * np.sqrt(dof / 2), dof):
         i = next(i for i, group in enumerate(groups) if group is found.shortest)
         return replace(parts[i], standard_error_dn2=float(error[i]))
     variance, chance = (np.array([getattr(part, name) for part in parts]) for name in ("variance_dn2", "chance_dn2"))

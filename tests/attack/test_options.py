@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shlex
 import struct
@@ -120,6 +121,15 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture
+def no_collection():
+    """In a process with many compiled programs, collecting garbage takes seconds, which would count as work."""
+    gc.disable()
+    yield
+    gc.enable()
+
+
+@pytest.mark.usefixtures("no_collection")
 @pytest.mark.parametrize("words", ATTACKS)
 def test_is_one_sentence(words, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
