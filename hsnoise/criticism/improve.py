@@ -313,10 +313,10 @@ class _Work:
     ) -> tuple[FitResult, Improvement, float] | Refusal:
         """A fit with the effect, what it gains, and by how many nats its side of the gain is ahead; or why it is none.
 
-        `diagnose` judges the side from a base fit that the effect has biased: what holds is fitted on the other, too.
+        `diagnose` judges the side from a biased base fit: what holds is fitted on the other, too. One gain tells none.
         """
         found = self.fitted_with(steps, effect, f"adding {effect.name}")
-        ahead = 0.0 if has_sides(effect) else float("nan")  # in frames of one gain both sides are equally likely
+        ahead = 0.0 if has_sides(effect) and not side_shows(effect, self.fitted.cfa) else float("nan")
         if found is None:
             return Refusal(Refused.NOT_FITTED)
         gain = self.judged(judge, steps, found, effect.name)

@@ -370,17 +370,12 @@ def _shown(value: Any) -> str:
 
 
 def draw_poisson(key: RandomKey, mean: jax.Array, shape: tuple[int, ...]) -> Frames:
-    """Poisson counts of `shape`, as floats, given a mean per pixel or one for all.
+    """Poisson counts of `shape`, as floats, given a mean per pixel or one for all; from the first word of each pixel.
 
     Counts are whole numbers, so a draw has no derivative with respect to its mean.
     """
     first, _ = pixel_words(key, shape)
     return poisson_of_bits(first, jax.lax.stop_gradient(mean)).astype(mean.dtype)
-
-
-def electrons_of_pixels(key: RandomKey, mean: Frames) -> Frames:
-    """Poisson counts given the means of all pixels, from the first word of each pixel; no derivative, as above."""
-    return draw_poisson(key, mean, mean.shape)
 
 
 def step_from_previous(signal: Frames) -> Frames:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from hsnoise._core.types import Frames, RandomKey
-from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, electrons_of_pixels
+from hsnoise.effects._base import PIXELS, AbstractEffect, Capture, Stage, draw_poisson
 
 
 class ShotNoise(AbstractEffect):
@@ -20,4 +20,4 @@ class ShotNoise(AbstractEffect):
     stream: ClassVar[str] = PIXELS
 
     def sample(self, signal: Frames, capture: Capture, *, key: RandomKey) -> Frames:
-        return electrons_of_pixels(key, signal)
+        return draw_poisson(key, signal, signal.shape)

@@ -322,6 +322,14 @@ def test_one_gain_does_not_tell_the_side(monkeypatch):
     assert np.isnan(work.with_one_more([], fx.HotPixels(0.01, 100.0), None)[2])
 
 
+def test_a_side_that_cannot_be_fitted_is_not_called_as_likely(monkeypatch):
+    fits = iter([SimpleNamespace(params=Side.BEFORE), None])
+    monkeypatch.setattr(_Work, "fitted_with", lambda *of: next(fits))
+    monkeypatch.setattr(_Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
+    work = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, print)
+    assert np.isnan(work.with_one_more([], fx.RowNoise(1.0), None)[2])
+
+
 def draft_of(last_step):
     return Draft(None, None, None, None, None, last_step, 5)
 
