@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 
-from hsnoise._core.poisson import normal_of_bits, pixel_words, uniform_of_bits, uniform_of_pixels
+from hsnoise._core.poisson import by_quantiles, normal_of_bits, pixel_words, uniform_of_bits, uniform_of_pixels
 from hsnoise._core.types import RandomKey, Scalar
 
 LARGEST_LOGIT = 22.9  # of a uniform number of 32 bits
@@ -25,12 +25,7 @@ def log_gamma_of_pixels(key: RandomKey, a: Scalar, shape: tuple[int, ...]) -> ja
     The quantile function, from a table over the logit of a uniform number: both tails are straight lines there, nearly.
     """
     bits, _ = pixel_words(key, shape)
-    odds = [jnp.log(b.astype(a.dtype) + 0.5) for b in (bits, ~bits)]
-    place = (odds[0] - odds[1]) * ((KNOTS - 1) / (2 * LARGEST_LOGIT)) + (KNOTS - 1) / 2
-    table = log_quantiles(a)
-    below = jnp.clip(place.astype(jnp.int32), 0, KNOTS - 2)
-    share = place - below
-    return table[below] * (1 - share) + table[below + 1] * share
+    return by_quantiles(bits, log_quantiles(a), LARGEST_LOGIT)
 
 
 def log_quantiles(a: Scalar) -> jax.Array:

@@ -112,6 +112,19 @@ def normal_of_pixels(key: jax.Array, shape: tuple[int, ...], dtype=float) -> jax
     return normal_of_bits(pixel_words(key, shape)[1]).astype(dtype)
 
 
+def by_quantiles(bits: jax.Array, quantiles: jax.Array, largest_logit: float) -> jax.Array:
+    """Numbers of the distribution with these quantiles [knot], from random bits (uint32).
+
+    Knots are at equal steps of the logit, up to the largest; beyond, the outermost stand for all.
+    """
+    odds = [jnp.log(word.astype(quantiles.dtype) + 0.5) for word in (bits, ~bits)]
+    last = len(quantiles) - 1
+    place = jnp.clip((odds[0] - odds[1]) / (2 * largest_logit) + 0.5, 0, 1) * last
+    below = jnp.clip(place.astype(jnp.int32), 0, last - 1)
+    share = place - below
+    return quantiles[below] * (1 - share) + quantiles[below + 1] * share
+
+
 def _middle_of_cell(bits: jax.Array) -> jax.Array:
     # 23 bits and the middle of the cell are exact in float32, and never 0 or 1.
     return ((bits >> 9).astype(jnp.float32) + 0.5) * jnp.float32(2.0**-23)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from hsnoise._core.poisson import pixel_words
+from hsnoise._core.poisson import by_quantiles, pixel_words
 from hsnoise._core.types import Frames, RandomKey, Scalar
 from hsnoise.effects._base import AbstractEffect, Capture, Stage
 from hsnoise.effects._parameters import measured, param
@@ -87,12 +86,7 @@ class MeasuredDistribution(AbstractEffect):
 
     def _draw(self, key: RandomKey, like: Frames) -> Frames:
         bits, _ = pixel_words(key, like.shape)
-        odds = [jnp.log(b.astype(like.dtype) + 0.5) for b in (bits, ~bits)]
-        last = len(self.quantiles) - 1
-        place = jnp.clip((odds[0] - odds[1]) / (2 * LARGEST_LOGIT) + 0.5, 0, 1) * last
-        below = jnp.clip(place.astype(jnp.int32), 0, last - 1)
-        share = place - below
-        return self.quantiles[below] * (1 - share) + self.quantiles[below + 1] * share
+        return by_quantiles(bits, self.quantiles.astype(like.dtype), LARGEST_LOGIT)
 
     def components(self, capture: Capture) -> dict[str, float]:
         return {"temporal": capture.offset_variance(self.sigma**2)}
