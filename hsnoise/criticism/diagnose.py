@@ -33,7 +33,7 @@ from hsnoise.criticism.candidates import (
 from hsnoise.criticism.clamp import CLAMP, clamp_by_likelihood
 from hsnoise.criticism.finding import WORST, Diagnosis
 from hsnoise.criticism.fingerprint import Bench
-from hsnoise.criticism.nearest import nearest
+from hsnoise.criticism.nearest import nearest, together
 from hsnoise.criticism.outcomes import Verdict
 from hsnoise.criticism.ranking import Evidence, Judged, limit_by_chance
 from hsnoise.criticism.search import MANY_DETAILS, Search
@@ -152,7 +152,8 @@ def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, ti
     if found.verdict != Verdict.UNEXPLAINED:
         return found, evidence
     prints, variance = [one.of for one in judged], np.diagonal(base.distribution.covariance)
-    return replace(found, nearest=nearest(prints, found.ranking, evidence, slopes, variance)), evidence
+    near = nearest(prints, found.ranking, evidence, slopes, variance)
+    return replace(found, nearest=near, together=together(prints, near, evidence, slopes, variance)), evidence
 
 
 def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis, list[Judged], Evidence]:

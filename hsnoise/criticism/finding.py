@@ -51,6 +51,7 @@ class Diagnosis:
         unexplained: what remains.
         nearest: if none explains the capture, the effects that explain most statistics, best first; `improve` tries
             them. The scores of the ranking then mean little.
+        together: of these, the effects that explain most statistics if they are in the sensor together.
     """
 
     ranking: tuple[Candidate, ...]
@@ -60,6 +61,7 @@ class Diagnosis:
     advice: str
     unexplained: Unexplained
     nearest: tuple[Candidate, ...] = ()
+    together: tuple[Candidate, ...] = ()
 
     @property
     def headline(self) -> str:

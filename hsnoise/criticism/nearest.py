@@ -9,17 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from hsnoise._core.threads import in_threads
 from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.fingerprint import Fingerprint
 from hsnoise.criticism.ranking import GRID, Candidate, Evidence
+from hsnoise.effects import AbstractEffect
 from hsnoise.simulation.reference import misfits
 
 FREEDOM = 4.0
 ITERATIONS = 10
+MOST_TOGETHER = 4  # effects that are added at once
 
 
 def nearest(
@@ -49,6 +53,50 @@ def nearest(
     if of_worst is None or of_worst.name in [one.name for one in ordered[:1]]:
         return tuple(ordered)
     return (*ordered[:1], of_worst, *(one for one in ordered[1:] if one.name != of_worst.name))
+
+
+def together(
+    prints: Iterable[Fingerprint],
+    nearest: Sequence[Candidate],
+    evidence: Evidence,
+    slopes: np.ndarray,
+    variance: np.ndarray,
+) -> tuple[Candidate, ...]:
+    """Of the nearest candidates, those that explain most together: each a part that the ones before it leave.
+
+    Once another has joined them, those chosen before are fitted again to what is left for them.
+    """
+    drawn, listed = {of.name: of for of in prints}, {one.name: one for one in nearest}
+    chosen: dict[str, _Part] = {}
+
+    def part_of(name: str) -> _Part:
+        """What is best left to one of them, whether it is chosen already or not."""
+        left = evidence.z - sum(part.shift for other, part in chosen.items() if other != name)
+        return _part(drawn[name], left, slopes, variance)
+
+    while len(chosen) < min(MOST_TOGETHER, len(listed)):
+        others = [name for name in listed if name not in chosen]
+        best, name = min(zip(in_threads(part_of, others), others, strict=True), key=lambda pair: pair[0].loss)
+        if best.before - best.loss < evidence.least:
+            break
+        chosen[name] = best
+        if len(chosen) > 1:
+            chosen |= {one: part_of(one) for one in chosen}
+    return tuple(replace(listed[name], effect=part.effect) for name, part in chosen.items())
+
+
+class _Part(NamedTuple):
+    """One of several effects: the loss without and with it, its shift of the statistics [statistic], itself."""
+
+    before: float
+    loss: float
+    shift: np.ndarray
+    effect: AbstractEffect
+
+
+def _part(of: Fingerprint, left: np.ndarray, slopes: np.ndarray, variance: np.ndarray) -> _Part:
+    loss, amplitude, detail = _best(of, lambda shift: _loss(left - shift, slopes, variance))
+    return _Part(_loss(left, slopes, variance), loss, of.at(amplitude)[detail], made(of.maker, amplitude, detail))
 
 
 def _of_worst_group(

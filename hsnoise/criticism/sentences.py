@@ -295,11 +295,19 @@ def fell_together(before: float, after: float) -> str:
     return f", total misfit of all groups {number(before)} -> {number(after)}"
 
 
-def because(nearer: Sequence[str], score: float, is_nearest: bool) -> str:
+def all_of(names: Sequence[str]) -> str:
+    """Names as a sentence lists them: "a, b and c"."""
+    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+
+
+def because(nearer: Sequence[str], score: float, is_nearest: bool, beside: Sequence[str]) -> str:
     """Why an effect was added: the statistics that it improved, or else its score, nats.
 
-    is_nearest: whether no effect explains everything that was off.
+    is_nearest: whether no effect explains everything that was off; beside: effects that were fitted at once with it.
     """
+    if beside:
+        reason = nearer[0] if nearer else "frames are predicted worse without it"
+        return f"{reason} (fitted together with {all_of(beside)})"
     reason = nearer[0] if nearer else f"its fingerprint is in the statistics (score {score:.0f} nats)"
     return f"{reason} (no effect explains everything; this one comes nearest)" if is_nearest else reason
 

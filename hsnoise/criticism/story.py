@@ -38,6 +38,7 @@ class Step:
         ahead: by how much what was added is likelier on its side of the gain than on the other, nats; NaN without.
         held_out_error: standard error of the change of `held_out` from the step before, by its simulation, nats.
         gained: nats that frames of the fit gained by what was added, where they judged it; NaN if held-out ones did.
+        beside: names of the effects that were fitted together with what was added.
     """
 
     fit: FitResult
@@ -49,6 +50,7 @@ class Step:
     ahead: float = float("nan")
     held_out_error: float = float("nan")
     gained: float = float("nan")
+    beside: tuple[str, ...] = ()
 
     @property
     def sizes(self) -> tuple[str, ...]:
@@ -240,7 +242,7 @@ def _because(before: Step, after: Step) -> str:
     found, ranking = before.diagnosis, () if before.diagnosis is None else before.diagnosis.ranking
     score = next((one.score for one in ranking if one.name == after.added), 0.0)
     is_nearest = found is not None and found.verdict == Verdict.UNEXPLAINED and not after.comparison.fits
-    return sentences.because(nearer(before.comparison, after.comparison), score, is_nearest)
+    return sentences.because(nearer(before.comparison, after.comparison), score, is_nearest, after.beside)
 
 
 def moved(before: FitResult, after: FitResult) -> tuple[str, ...]:

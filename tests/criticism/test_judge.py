@@ -10,7 +10,7 @@ import pytest
 import hsnoise
 import hsnoise.effects as fx
 from hsnoise.criticism import held_out as of_frames
-from hsnoise.criticism.acceptance import judged
+from hsnoise.criticism.acceptance import judged, those_that_hold
 from hsnoise.criticism.held_out import LEAST_DRAWS, Judge, split_frames, with_flats
 from hsnoise.criticism.outcomes import Improvement, Refused
 from hsnoise.frames.joining import replaced
@@ -111,6 +111,54 @@ def test_an_effect_must_be_better_than_the_model_and_than_itself_without_it():
     assert told(ROWS, ROWS.add(fx.FrameOffset(1e-3)), "frame_offset").why == Refused.NO_BETTER
     only_refitted = ROWS.add(fx.FrameOffset(1e-3))
     assert told(MODEL, only_refitted, "frame_offset").why == Refused.NO_CHANGE
+
+
+TWO = ROWS.add(fx.FrameOffset(3.0))
+
+
+def fits_of(*models):
+    """A fit for each set of effects that is asked for, and what was asked for."""
+    asked = []
+
+    def fitted(effects):
+        asked.append([effect.name for effect in effects])
+        names = set(asked[-1])
+        return next(
+            SimpleNamespace(params=one, names=(*BASE_NAMES, *names)) for one in models if names < set(one.names)
+        )
+
+    return fitted, asked
+
+
+BASE_NAMES = tuple(MODEL.names)
+
+
+def test_of_effects_that_were_fitted_at_once_those_stay_that_hold_beside_the_others():
+    judge = Judge.of(*split(capture(TWO), 6), 0)
+    nothing = fx.ColumnNoise(1e-3)
+    fitted, asked = fits_of(TWO, TWO.add(nothing))
+    before, ticks = SimpleNamespace(params=MODEL, names=BASE_NAMES), []
+    effects = [nothing, TWO["frame_offset"], TWO["row_noise"]]
+    held = those_that_hold(judge, before, effects, fitted, lambda: ticks.append(1))
+    assert asked == [["column_noise", "frame_offset", "row_noise"], ["frame_offset", "row_noise"]] and ticks
+    assert held.fit.params is TWO and set(held.names) == {"frame_offset", "row_noise"} and held.gain.holds
+    alone = {name: judge.improvement(TWO.remove(name), TWO, 1).nats for name in held.names}
+    assert held.names == tuple(sorted(alone, key=alone.__getitem__, reverse=True))
+
+
+def test_effects_that_only_make_up_for_one_another_do_not_stay():
+    """Each holds beside the other, but both together are no better than neither."""
+    judge = SimpleNamespace(improvement=lambda before, after, numbers, tick: Improvement(worth(after, before), 0.1, 0))
+    before = SimpleNamespace(params=MODEL, names=BASE_NAMES)
+
+    def worth(*models):
+        after, of_before = ({"row_noise", "frame_offset"} & set(one.names) for one in models)
+        return 50.0 * ((len(after) != 1) - (len(of_before) != 1))
+
+    fitted, asked = fits_of(TWO)
+    assert those_that_hold(judge, before, [TWO["row_noise"], TWO["frame_offset"]], fitted, lambda: None) is None
+    assert len(asked) == 1
+    assert those_that_hold(judge, before, [TWO["row_noise"]], lambda effects: None, lambda: None) is None
 
 
 def test_flats_are_judged_beside_the_darks_held_out():

@@ -20,9 +20,9 @@ from hsnoise.criticism import rules, sentences
 from hsnoise.criticism.acceptance import is_too_little
 from hsnoise.criticism.compare import Comparison, nearer
 from hsnoise.criticism.held_out import Judge, split_frames
-from hsnoise.criticism.improve import _ending, _Work
 from hsnoise.criticism.outcomes import Ended, Ending, Improvement, Refusal, Refused, Side, side_of
 from hsnoise.criticism.story import Step, Story, together
+from hsnoise.criticism.work import Work, _ending
 from hsnoise.fitting.simulated import Draft
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
@@ -203,7 +203,7 @@ def test_improve_decides_the_side_of_the_gain_by_refits(tmp_path):
     stack, told = simulated(tmp_path)[0], []
     steps = [Step(hsnoise.fit(stack), SimpleNamespace(error=9.0), None, None, float("nan"), ())]
     judge = Judge(Portion.of(stack), False, 0)
-    work = _Work(stack, Portion.of(stack), judge, 0, lambda event: told.append(str(event)))
+    work = Work(stack, Portion.of(stack), judge, 0, lambda event: told.append(str(event)))
     fit, gain, ahead = work.with_one_more(steps, fx.RowNoise(1.4, after_gain=True), judge)
     assert fit.params["row_noise"].after_gain is False and ahead > 0 and hsnoise.compare(fit, stack).fits and gain.holds
     assert any("adding row_noise" in sentence for sentence in told)
@@ -262,12 +262,12 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
         tried.append(effect.name)
         return reasons.get(effect.name, (fit, Improvement(30.0, 2.0, 1), 9.0))
 
-    of = importlib.import_module("hsnoise.criticism.improve")
-    monkeypatch.setattr(_Work, "with_one_more", with_one_more)
-    monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
+    of = importlib.import_module("hsnoise.criticism.work")
+    monkeypatch.setattr(Work, "with_one_more", with_one_more)
+    monkeypatch.setattr(Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
     monkeypatch.setattr(of, "rechecked", lambda *of: checked)
     judge = SimpleNamespace(of_effect=lambda effect, portion: judge)
-    work = _Work(None, None, judge, 0, lambda event: told.append(str(event)))
+    work = Work(None, None, judge, 0, lambda event: told.append(str(event)))
     kept = Step(checked, None, None, "column_noise", held_out=10.0, ahead=9.0, held_out_error=2.0)
     assert work.first_that_holds(candidates, [before]) == (kept, reasons)
     assert tried == ["row_noise", "frame_offset", "column_noise"]
@@ -281,13 +281,13 @@ def test_candidates_are_tried_until_one_holds(monkeypatch):
 def test_what_the_frames_of_the_fit_judged_is_told(monkeypatch):
     """Frames held out then say only how likely they are."""
     fit = SimpleNamespace(params={"image_lag": fx.ImageLag(0.04)}, in_dn=lambda name: {}, doubts=())
-    of = importlib.import_module("hsnoise.criticism.improve")
-    monkeypatch.setattr(_Work, "with_one_more", lambda *of: (fit, Improvement(30.0, 2.0, 1), float("nan")))
-    monkeypatch.setattr(_Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
+    of = importlib.import_module("hsnoise.criticism.work")
+    monkeypatch.setattr(Work, "with_one_more", lambda *of: (fit, Improvement(30.0, 2.0, 1), float("nan")))
+    monkeypatch.setattr(Work, "step", lambda self, fit, added, steps: Step(fit, None, None, added))
     monkeypatch.setattr(of, "rechecked", lambda fit, frames: fit)
     judge = SimpleNamespace(of_effect=lambda effect, portion: object(), score=lambda model: -25.0)
     candidate = SimpleNamespace(name="image_lag", effect=fx.ImageLag(0.04))
-    work = _Work(None, None, judge, 0, lambda event: None)
+    work = Work(None, None, judge, 0, lambda event: None)
     step, _ = work.first_that_holds([candidate], [Step(fit, None, None, None, held_out=-20.0)])
     assert step.held_out == -25.0 and np.isnan(step.held_out_error) and step.gained == 30.0
     assert "those of the fit are predicted better by 30.0 nats" in step.sizes[-1]
@@ -295,38 +295,38 @@ def test_what_the_frames_of_the_fit_judged_is_told(monkeypatch):
 
 @pytest.mark.parametrize(("scores", "side"), [((5.0, 3.0), Side.BEFORE), ((3.0, 5.0), Side.AFTER)])
 def test_only_what_holds_is_tried_on_the_other_side(monkeypatch, scores, side):
-    of = importlib.import_module("hsnoise.criticism.improve")
+    of = importlib.import_module("hsnoise.criticism.work")
     score, fitted = dict(zip(Side, scores, strict=True)), []
 
     def fitted_with(self, steps, effect, what):
         fitted.append(side_of(effect))
         return SimpleNamespace(params=side_of(effect))
 
-    monkeypatch.setattr(_Work, "fitted_with", fitted_with)
+    monkeypatch.setattr(Work, "fitted_with", fitted_with)
     monkeypatch.setattr(of, "score_of_side", lambda params, portion, seed: score[params])
     colours, gain, effect = SimpleNamespace(cfa="RGGB"), Improvement(30.0, 2.0, 1), fx.RowNoise(1.0)
-    work = _Work(colours, None, None, 0, print)
-    monkeypatch.setattr(_Work, "judged", lambda *of: gain)
+    work = Work(colours, None, None, 0, print)
+    monkeypatch.setattr(Work, "judged", lambda *of: gain)
     fit, same, ahead = work.with_one_more([], effect, None)
     assert (fit.params, same, ahead) == (side, gain, 2.0) and fitted == list(Side)
     refusal = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1))
-    monkeypatch.setattr(_Work, "judged", lambda *of: refusal)
+    monkeypatch.setattr(Work, "judged", lambda *of: refusal)
     assert work.with_one_more([], effect, None) is refusal and len(fitted) == 3
 
 
 def test_one_gain_does_not_tell_the_side(monkeypatch):
-    monkeypatch.setattr(_Work, "fitted_with", lambda self, steps, effect, what: SimpleNamespace(params=side_of(effect)))
-    monkeypatch.setattr(_Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
-    work = _Work(SimpleNamespace(cfa="mono"), None, None, 0, print)
+    monkeypatch.setattr(Work, "fitted_with", lambda self, steps, effect, what: SimpleNamespace(params=side_of(effect)))
+    monkeypatch.setattr(Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
+    work = Work(SimpleNamespace(cfa="mono"), None, None, 0, print)
     assert work.with_one_more([], fx.RowNoise(1.0), None)[::2] == (SimpleNamespace(params=Side.BEFORE), 0.0)
     assert np.isnan(work.with_one_more([], fx.HotPixels(0.01, 100.0), None)[2])
 
 
 def test_a_side_that_cannot_be_fitted_is_not_called_as_likely(monkeypatch):
     fits = iter([SimpleNamespace(params=Side.BEFORE), None])
-    monkeypatch.setattr(_Work, "fitted_with", lambda *of: next(fits))
-    monkeypatch.setattr(_Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
-    work = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, print)
+    monkeypatch.setattr(Work, "fitted_with", lambda *of: next(fits))
+    monkeypatch.setattr(Work, "judged", lambda *of: Improvement(30.0, 2.0, 1))
+    work = Work(SimpleNamespace(cfa="RGGB"), None, None, 0, print)
     assert np.isnan(work.with_one_more([], fx.RowNoise(1.0), None)[2])
 
 
@@ -339,10 +339,10 @@ def test_a_fit_is_finished_only_if_it_holds_so_far(monkeypatch):
     draft, whole, seen = draft_of(0.1), SimpleNamespace(), []
     refusal, gain = Refusal(Refused.NO_BETTER, Improvement(1.0, 2.0, 1)), Improvement(30.0, 2.0, 1)
     of = {id(draft): refusal}
-    monkeypatch.setattr(_Work, "fitted_with", lambda *of: draft)
-    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: of[id(fit)])
+    monkeypatch.setattr(Work, "fitted_with", lambda *of: draft)
+    monkeypatch.setattr(Work, "judged", lambda self, judge, steps, fit, name: of[id(fit)])
     monkeypatch.setattr(Draft, "finished", lambda self: seen.append(self) or whole)
-    work, effect = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
+    work, effect = Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None), fx.HotPixels(0.01, 9.0)
     assert work.with_one_more([], effect, None) is refusal and not seen
     of[id(draft)] = gain
     assert work.with_one_more([], effect, None)[:2] == (whole, gain) and seen == [draft]
@@ -364,14 +364,14 @@ def test_the_likelier_side_of_the_gain_is_judged_and_kept(monkeypatch):
     first, other = draft_of(0.1), draft_of(0.1)
     drafts, judged = iter([first, other, first, other]), []
     gain = Improvement(30.0, 2.0, 1)
-    monkeypatch.setattr(_Work, "fitted_with", lambda *of: next(drafts))
-    monkeypatch.setattr(_Work, "judged", lambda self, judge, steps, fit, name: judged.append(fit) or gain)
+    monkeypatch.setattr(Work, "fitted_with", lambda *of: next(drafts))
+    monkeypatch.setattr(Work, "judged", lambda self, judge, steps, fit, name: judged.append(fit) or gain)
     monkeypatch.setattr(Draft, "finished", lambda self: self)
     monkeypatch.setattr(Draft, "params", None)
     scores = iter([5.0, 2.0, 2.0, 6.0])
-    module = importlib.import_module("hsnoise.criticism.improve")
+    module = importlib.import_module("hsnoise.criticism.work")
     monkeypatch.setattr(module, "score_of_side", lambda *of: next(scores))
-    work = _Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None)
+    work = Work(SimpleNamespace(cfa="RGGB"), None, None, 0, lambda event: None)
     assert work.with_one_more([], fx.FrameOffset(2.0), None) == (first, gain, 3.0) and judged == [first]
     assert work.with_one_more([], fx.FrameOffset(2.0), None) == (other, gain, 4.0) and judged[1:] == [first, other]
 

@@ -12,7 +12,7 @@ from hsnoise.criticism import rules
 from hsnoise.criticism.candidates import made
 from hsnoise.criticism.finding import Diagnosis, Unexplained
 from hsnoise.criticism.fingerprint import Fingerprint
-from hsnoise.criticism.nearest import nearest
+from hsnoise.criticism.nearest import nearest, together
 from hsnoise.criticism.ranking import (
     GRID,
     Candidate,
@@ -191,6 +191,32 @@ def test_what_takes_most_from_the_worst_group_is_tried_after_what_explains_most_
     assert [one.name for one in nearest(prints, ranking, found, no_base, ones)] == ["many", "few", "other"]
     without = [one.name for one in nearest(prints[:2], ranking, found, no_base, ones)]
     assert without == ["many", "other"]  # neither takes half of what is off there
+
+
+def test_together_are_effects_that_explain_different_parts_and_no_two_that_explain_one():
+    """Rivals of the first explain the same statistics, and leave nothing for one another; each has its own size."""
+    first, rival = fingerprint("first", slice(0, 18)), fingerprint("rival", slice(1, 18))
+    second, third, absent = (
+        fingerprint("second", slice(16, 24)),
+        fingerprint("third", slice(30, 34)),
+        fingerprint("absent", slice(35, 40)),
+    )
+    z = evidence(first, amplitude=1.5).z + second.at(0.6).mean(0) + third.at(0.8).mean(0)
+    found = Evidence(z, Gaussian(np.zeros(STATISTICS), np.eye(STATISTICS)), NAMES, GROUPS, 5)
+    prints = [rival, third, absent, second, first]
+    ranking = [judge(of, found).candidate(found) for of in prints]
+    base = (found, np.zeros((1, STATISTICS)), np.ones(STATISTICS))
+    near = nearest(prints, ranking, *base)
+    assert {"first", "rival"} < {one.name for one in near}
+    chosen = together(prints, near, *base)
+    assert [one.name for one in chosen] == ["first", "second", "third"]
+    # GRID[::2] has steps of a factor of 1.5.
+    for one, size in zip(chosen, (1.5, 0.6, 0.8), strict=True):
+        assert abs(np.log(float(one.effect.sigma) / size)) < 0.25
+    # What a wrong base parameter would do is left to the base.
+    of_base = (found, second.at(1.0).mean(0)[None], np.ones(STATISTICS))
+    assert [one.name for one in together(prints, near, *of_base)] == ["first", "third"]
+    assert together(prints, (), *base) == ()
 
 
 def test_rare_statistics_that_go_with_others_leave_a_distribution():
