@@ -35,7 +35,8 @@ from hsnoise.criticism.finding import WORST, Diagnosis
 from hsnoise.criticism.fingerprint import Bench
 from hsnoise.criticism.nearest import nearest, together
 from hsnoise.criticism.outcomes import Verdict
-from hsnoise.criticism.ranking import Evidence, Judged, limit_by_chance
+from hsnoise.criticism.ranking import Evidence, Judged, Pair, limit_by_chance
+from hsnoise.criticism.refine import WithBase
 from hsnoise.criticism.search import MANY_DETAILS, Search
 from hsnoise.criticism.verdict import verdict_of, what_remains
 from hsnoise.fitting.result import FitResult
@@ -165,14 +166,7 @@ def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis,
     if evidence.least < judged[0].score < rules.MARKOV_UP_TO:
         evidence = replace(evidence, chance=_limit(judged, draws, seed, search))
         search = replace(search, evidence=evidence)
-    pair = None
-    if _leaves_something(judged[0], evidence):
-        judged = search.closer(judged)
-    if _leaves_something(judged[0], evidence):  # one effect alone does not do: which others could, and closer again
-        judged = search.closer(search.partners(judged))
-    judged, freed = search.with_its_base(judged)
-    if _leaves_something(judged[0], evidence):
-        pair = search.best_pair(judged)
+    judged, freed, pair = (judged, None, None) if search.is_in_vain(judged) else _closely(search, judged)
     ranking = [one.candidate(evidence) for one in judged]
     with_each = {one.of.name: one.of.distribution(one.amplitude, evidence.null) for one in judged[:1]}
     if freed is not None:
@@ -189,6 +183,17 @@ def _found(search: Search, fit, draws: int, seed: RandomKey) -> tuple[Diagnosis,
             if found.best is candidate:
                 found = replace(found, unexplained=what_remains(left, distribution))
     return found, judged, evidence
+
+
+def _closely(search: Search, judged: list[Judged]) -> tuple[list[Judged], WithBase | None, Pair | None]:
+    """Candidates after a closer look at the likely ones, the first with the base fitted to it, and the best pair."""
+    evidence = search.evidence
+    if _leaves_something(judged[0], evidence):
+        judged = search.closer(judged)
+    if _leaves_something(judged[0], evidence):  # one effect alone does not do: which others could, and closer again
+        judged = search.closer(search.partners(judged))
+    judged, freed = search.with_its_base(judged)
+    return judged, freed, search.best_pair(judged) if _leaves_something(judged[0], evidence) else None
 
 
 def _leaves_something(first: Judged, evidence: Evidence) -> bool:

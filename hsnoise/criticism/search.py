@@ -88,6 +88,16 @@ class Search:
         again = {one.of.name: one for one in judge_all(self.bench.fingerprints(wanted, DETAILS), self.evidence)}
         return _best_first(again.get(one.of.name, one) for one in judged)
 
+    def is_in_vain(self, judged: list[Judged]) -> bool:
+        """Whether a closer look at one or two effects is in vain: neither a leader nor a pair takes half of the misfit.
+
+        More than two are missing then, or none of the library. Shifts of the right effect are known within some 12 %.
+        """
+        limit = max(rules.HALF * self.evidence.misfit(self.evidence.null), rules.MOST_LEFT)
+        if min(one.misfit for one in judged[:LEADERS]) <= limit:
+            return False
+        return min((pair.misfit for pair in best_pairs(judged, self.evidence, LEADERS)), default=limit) >= limit
+
     def closer(self, judged: list[Judged]) -> list[Judged]:
         """The leaders with parameters closer to the capture: fingerprints bend, and strong effects show it.
 

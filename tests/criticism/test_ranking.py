@@ -23,6 +23,7 @@ from hsnoise.criticism.ranking import (
     judge,
     limit_by_chance,
 )
+from hsnoise.criticism.search import Search
 from hsnoise.criticism.verdict import verdict_of
 from hsnoise.simulation.gaussian import Gaussian, shrunk
 
@@ -217,6 +218,17 @@ def test_together_are_effects_that_explain_different_parts_and_no_two_that_expla
     of_base = (found, second.at(1.0).mean(0)[None], np.ones(STATISTICS))
     assert [one.name for one in together(prints, near, *of_base)] == ["first", "third"]
     assert together(prints, (), *base) == ()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "size", "in_vain"),
+    [("one", 5.0, False), ("one two", 5.0, False), ("one two three", 5.0, True), ("one two three", 0.25, False)],
+)
+def test_a_closer_look_at_one_or_two_is_in_vain_where_more_are_missing(hidden, size, in_vain):
+    prints = {name: fingerprint(name, slice(i * 10, i * 10 + 9)) for i, name in enumerate(("one", "two", "three"))}
+    found = evidence(*(prints[name] for name in hidden.split()), amplitude=size)
+    judged = sorted((judge(of, found) for of in prints.values()), key=lambda one: -one.score)
+    assert Search(None, found, {}, {}).is_in_vain(judged) is in_vain
 
 
 def test_rare_statistics_that_go_with_others_leave_a_distribution():
