@@ -61,7 +61,7 @@ def test_a_model_with_the_course_is_like_the_frames():
 @pytest.mark.slow
 def test_frames_held_out_are_later_ones_of_the_course():
     stack = drawn(settling, frames=24)
-    first, last = split_frames(Portion.of(stack).darks.frames, stack)
+    first, last = split_frames(Portion.of(stack), stack)
     fit = hsnoise.fit(first)
     found = closed(fit, first, held_out=last, before=(18,))
     assert found.comparison.groups["level"] < 5 and found.before.groups["level"] < 5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hsnoise.criticism import rules
 from hsnoise.criticism.held_out import Judge
@@ -48,13 +48,15 @@ def those_that_hold(
     before: FitResult,
     effects: Sequence[AbstractEffect],
     fitted: Callable[[Sequence[AbstractEffect]], FitResult | Draft | None],
+    tell: Callable[[str, Refusal], Any],
     tick: Callable[[], None],
 ) -> Held | None:
     """Of several effects, those with which the model is better, and also than itself without any one of them.
 
     Those that do not hold beside the others are taken out, and the others fitted again. None if no fit holds.
 
-    fitted: the model before with some effects more, or None if it cannot be fitted; tick: called after each draw.
+    fitted: the model before with some effects more, or None if it cannot be fitted; tell: called with the name of each
+    that is taken out, and why; tick: called after each draw.
     """
     while effects:
         found = fitted(effects)
@@ -68,6 +70,9 @@ def those_that_hold(
             whole = judge.improvement(before.params, found.params, len(found.names) - len(before.names), tick)
             names = sorted(gains, key=lambda name: gains[name].cost - gains[name].nats)
             return Held(found, tuple(names), whole) if whole.holds else None
+        for name, gain in gains.items():
+            if not gain.holds:
+                tell(name, Refusal(Refused.NO_CHANGE, gain))
         effects = [found.params[name] for name, gain in gains.items() if gain.holds]
     return None
 

@@ -29,15 +29,20 @@ MOST_DRAWN = 60_000_000  # pixels of the draws of a model
 SIDE_DRAWS = 40
 
 
-def split_frames(darks: FrameStack, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
-    """The stack without the last frames of its darks, and those; all and None if there are too few to spare."""
-    spared = [max(LEAST_HELD_OUT, int(SHARE * n)) for n in darks.n_frames]
-    kept = [n - some for n, some in zip(darks.n_frames, spared, strict=True)]
+def split_frames(portion: Portion, stack: FrameStack) -> tuple[FrameStack, FrameStack | None]:
+    """The stack without the last frames of its darks, and those; all and None if there are too few to spare.
+
+    Without darks that are not in its portion, where frames are spared.
+    """
+    darks = portion.darks
+    spared = [max(LEAST_HELD_OUT, int(SHARE * n)) for n in darks.frames.n_frames]
+    kept = [n - some for n, some in zip(darks.frames.n_frames, spared, strict=True)]
     if min(kept) < LEAST_FITTED:
         return stack, None
-    of_darks = iter(kept)
-    frames = [slice(next(of_darks)) if kind == "dark" else slice(None) for kind in stack.kind]
-    return stack.select(frames=frames), darks.select(frames=[slice(n, None) for n in kept])
+    used = [i for i, kind in enumerate(stack.kind) if kind != "dark" or i in darks.chosen]
+    of_darks = dict(zip(darks.chosen, kept, strict=True))
+    frames = [slice(of_darks.get(i)) for i in used]
+    return stack.select(exposures=used, frames=frames), darks.frames.select(frames=[slice(n, None) for n in kept])
 
 
 def with_flats(darks: FrameStack, flats: FrameStack) -> FrameStack:

@@ -97,8 +97,7 @@ def improved(
     """`improve`, reporting progress as events instead of sentences."""
     keep, seed = callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
-    darks = Portion.of(stack).darks.frames
-    fitted, held_out = split_frames(darks, stack)
+    fitted, held_out = split_frames(Portion.of(stack), stack)
     portion = Portion.of(fitted)
     check_start(model, candidates, portion, seed)
     limit = Limit.of(max_minutes, max_steps)

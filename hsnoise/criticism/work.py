@@ -69,6 +69,10 @@ class Work:
         log.info("%s", event)
         self.tell(event)
 
+    def say_refused(self, name: str, why: Refusal) -> None:
+        """Report an effect that is left out."""
+        self.say(Event(f"{name} is left out: {sentences.refusal(why)}"))
+
     def first(self, model: NoiseModel | None, follow: bool = False) -> FitResult:
         """A fit of the effects of a model; follow: of each pixel over time, whatever the frames say."""
         return fit(self.fitted, pixels="differ") if follow else fit(self.fitted, model=model)
@@ -186,7 +190,7 @@ class Work:
             found = self.with_one_more(steps, candidate.effect, judge)
             if isinstance(found, Refusal):
                 refused[candidate.name] = found
-                self.say(Event(f"{candidate.name} is left out: {sentences.refusal(found)}"))
+                self.say_refused(candidate.name, found)
                 continue
             result, gain, ahead = found
             step = replace(self.step(result, candidate.name, steps), ahead=ahead)
@@ -217,7 +221,7 @@ class Work:
                 lambda: _fit_with(effects, steps, self, tick), sentences.all_of([one.name for one in effects])
             )
 
-        held = those_that_hold(self.judge, last.fit, may, fitted, tick)
+        held = those_that_hold(self.judge, last.fit, may, fitted, self.say_refused, tick)
         if held is None:
             return []
         finished = self.finished(held, steps)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from hsnoise.simulation.defects import without_defects
 from hsnoise.statistics.structure import check_size
 
 MOST_PIXELS = 2_000_000  # beyond, statistics become sharper than any model, and draws slower
+MOST_LEVELS = 10  # of darks, and of flats: draws of many exposures take longer, and show no more
 LEAST_FRAMES, LEAST_COLUMNS = 8, 64
 WHOLE_COLUMNS = 16  # their number is a multiple: Fourier transforms of large primes take twice as long
 MIDDLE = (8, 320, 512)  # frames, rows and columns that are looked at
@@ -34,47 +37,37 @@ class Portion:
         frames: the exposures that are used, in memory, with their place on the sensor.
         left_out: sentences on what is not in it.
         before: for each exposure, how many frames were taken before the first one here; empty: none.
+        chosen: which exposures of the capture these are.
     """
 
     frames: FrameStack
     left_out: tuple[str, ...]
     before: tuple[int, ...] = ()
+    chosen: tuple[int, ...] = ()
 
     @staticmethod
     def of(stack: FrameStack, kinds: tuple[str, ...] = BOTH, before: tuple[int, ...] = ()) -> Portion:
         """The exposures of some kinds, cut to MOST_PIXELS.
 
-        Frames are left out first, then columns: a coloured row gain runs over all rows. Raises ValueError without
-        darks, for frames that are copies, and for frames too small to separate rows from pixels.
+        Exposures beyond MOST_LEVELS of a kind are left out first, then frames, then columns: a coloured row gain runs
+        over all rows. Raises ValueError without darks, for frames that are copies, and for frames too small to separate
+        rows from pixels.
         """
         check_size(stack)
         if "dark" not in stack.kind:
             raise ValueError("stack: expected dark frames, got flats only")
         # In a single flat, nothing tells noise from what is in the light.
         single = [i for i, kind in enumerate(stack.kind) if kind == "flat" and stack.n_frames[i] == 1]
-        chosen = [i for i, kind in enumerate(stack.kind) if kind in kinds and i not in single]
-        rows, columns = stack.shape
-        per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(chosen) * rows * columns))
-        frames = sum(min(stack.n_frames[i], per_exposure) for i in chosen)
-        kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
-        first = 0
-        if kept < columns:
-            kept = kept // WHOLE_COLUMNS * WHOLE_COLUMNS
-            first = (columns - kept) // 4 * 2
-        end = min(first + kept, columns)
-        part = stack.select(frames=slice(0, per_exposure), exposures=chosen, columns=(first, end))
-        bright = [i for i in range(part.n_exposures) if is_saturated(part, i)]
-        lit = [i for i, kind in enumerate(part.kind) if kind == "flat"]
-        full = [i for i in _beyond_the_range(part, lit) if i not in bright]
-        if bright or full:
-            kept_exposures = [i for i in range(part.n_exposures) if i not in (*bright, *full)]
-            part, chosen = part.select(exposures=kept_exposures), [chosen[i] for i in kept_exposures]
+        wanted = [i for i, kind in enumerate(stack.kind) if kind in kinds and i not in single]
+        cut = _Cut.of(stack, wanted)
+        bright, full = _beyond(cut.part(stack, wanted), wanted)
+        usable = [i for i in wanted if i not in (*bright, *full)]
+        chosen = _spread(stack, usable)
+        cut = cut if chosen == usable else _Cut.of(stack, chosen)
+        part = cut.part(stack, chosen)
         counts = [np.stack(list(part.frames(i))) for i in range(part.n_exposures)]
         check_no_copies(((hashlib.blake2b(frame).digest() for frame in of) for of in counts), part.exposure_s)
-        counts, of_defects = without_defects(counts, part.kind, len(cfa_tile(part.cfa)))
-        # What depends on the place stays where it is on the sensor.
-        window = part.window or ((0, first, rows, columns) if end - first < columns else None)
-        left_out = of_defects
+        counts, left_out = without_defects(counts, part.kind, len(cfa_tile(part.cfa)))
         if single and "flat" in kinds:
             flats = f"{len(single)} flats of a single frame"
             left_out.append(f"{flats} were not compared: one frame cannot separate noise from light")
@@ -83,11 +76,18 @@ class Portion:
         if full:
             which = f"{len(full)} level{'s' * (len(full) > 1)} of flats not compared: above {100 * LINEAR:.0f} % of"
             left_out.append(f"{which} saturation, which is where the temporal variance is largest (EMVA 1288)")
-        if end - first < columns:
-            left_out.append(f"only columns {first} to {end - 1} of {columns} were compared: large capture")
-        if frames < sum(stack.n_frames[i] for i in chosen):
-            left_out.append(f"only the first {per_exposure} frames of each exposure were compared: large capture")
-        return Portion(part.with_counts(counts, window), tuple(left_out), tuple(before[i] for i in chosen if before))
+        if chosen != usable:
+            left_out.append(f"{len(chosen)} of {len(usable)} exposures were compared, from the shortest to the longest")
+        rows, columns = stack.shape
+        is_cut = cut.end - cut.first < columns
+        if is_cut:
+            left_out.append(f"only columns {cut.first} to {cut.end - 1} of {columns} were compared: large capture")
+        if any(stack.n_frames[i] > cut.frames for i in chosen):
+            left_out.append(f"only the first {cut.frames} frames of each exposure were compared: large capture")
+        # What depends on the place stays where it is on the sensor.
+        window = part.window or ((0, cut.first, rows, columns) if is_cut else None)
+        ahead = tuple(before[i] for i in chosen if before)
+        return Portion(part.with_counts(counts, window), tuple(left_out), ahead, tuple(chosen))
 
     @cached_property
     def darks(self) -> Portion:
@@ -95,13 +95,61 @@ class Portion:
         dark = [i for i, kind in enumerate(self.frames.kind) if kind == "dark"]
         if len(dark) == self.frames.n_exposures:
             return self
-        before = tuple(self.before[i] for i in dark if self.before)
-        return Portion(self.frames.select(exposures=dark), self.left_out, before)
+        before, chosen = (tuple(of[i] for i in dark if of) for of in (self.before, self.chosen))
+        return Portion(self.frames.select(exposures=dark), self.left_out, before, chosen)
 
     def without_flats(self, why: str) -> Portion:
         """Its dark exposures, where flats cannot be compared."""
         darks = self.darks
         return darks if darks is self else replace(darks, left_out=(*self.left_out, f"flats were not compared: {why}"))
+
+
+class _Cut(NamedTuple):
+    """How many frames of each exposure, and which columns."""
+
+    frames: int
+    first: int
+    end: int
+
+    @staticmethod
+    def of(stack: FrameStack, exposures: Sequence[int]) -> _Cut:
+        """With MOST_PIXELS in these exposures, if that is possible."""
+        rows, columns = stack.shape
+        per_exposure = max(LEAST_FRAMES, MOST_PIXELS // (len(exposures) * rows * columns))
+        frames = sum(min(stack.n_frames[i], per_exposure) for i in exposures)
+        kept = max(LEAST_COLUMNS, MOST_PIXELS // (frames * rows))
+        if kept >= columns:
+            return _Cut(per_exposure, 0, columns)
+        kept = kept // WHOLE_COLUMNS * WHOLE_COLUMNS
+        first = (columns - kept) // 4 * 2
+        return _Cut(per_exposure, first, first + kept)
+
+    def part(self, stack: FrameStack, exposures: Sequence[int]) -> FrameStack:
+        """That of these exposures, nothing read."""
+        return stack.select(frames=slice(0, self.frames), exposures=exposures, columns=(self.first, self.end))
+
+
+def _beyond(part: FrameStack, of: Sequence[int]) -> tuple[list[int], list[int]]:
+    """The flats of a part that are saturated, and those beyond the linear range, by their numbers in `of`."""
+    bright = [i for i in range(part.n_exposures) if is_saturated(part, i)]
+    lit = [i for i, kind in enumerate(part.kind) if kind == "flat"]
+    full = [i for i in _beyond_the_range(part, lit) if i not in bright]
+    return [of[i] for i in bright], [of[i] for i in full]
+
+
+def _spread(stack: FrameStack, exposures: Sequence[int]) -> list[int]:
+    """At most MOST_LEVELS of a kind, in order, with the shortest and the longest.
+
+    Of exposures that could stand for one another, the one of most frames.
+    """
+    chosen: list[int] = []
+    for kind in BOTH:
+        some = sorted((i for i in exposures if stack.kind[i] == kind), key=lambda i: stack.exposure_s[i])
+        if len(some) > MOST_LEVELS:
+            between = [group.tolist() for group in np.array_split(some[1:-1], MOST_LEVELS - 2)]
+            some = [max(group, key=lambda i: stack.n_frames[i]) for group in (some[:1], *between, some[-1:])]
+        chosen += some
+    return sorted(chosen)
 
 
 def usable_flats(stack: FrameStack) -> list[int]:

@@ -138,8 +138,9 @@ def test_of_effects_that_were_fitted_at_once_those_stay_that_hold_beside_the_oth
     nothing = fx.ColumnNoise(1e-3)
     fitted, asked = fits_of(TWO, TWO.add(nothing))
     before, ticks = SimpleNamespace(params=MODEL, names=BASE_NAMES), []
-    effects = [nothing, TWO["frame_offset"], TWO["row_noise"]]
-    held = those_that_hold(judge, before, effects, fitted, lambda: ticks.append(1))
+    effects, told = [nothing, TWO["frame_offset"], TWO["row_noise"]], {}
+    held = those_that_hold(judge, before, effects, fitted, told.__setitem__, lambda: ticks.append(1))
+    assert list(told) == ["column_noise"] and told["column_noise"].why == Refused.NO_CHANGE
     assert asked == [["column_noise", "frame_offset", "row_noise"], ["frame_offset", "row_noise"]] and ticks
     assert held.fit.params is TWO and set(held.names) == {"frame_offset", "row_noise"} and held.gain.holds
     alone = {name: judge.improvement(TWO.remove(name), TWO, 1).nats for name in held.names}
@@ -156,9 +157,9 @@ def test_effects_that_only_make_up_for_one_another_do_not_stay():
         return 50.0 * ((len(after) != 1) - (len(of_before) != 1))
 
     fitted, asked = fits_of(TWO)
-    assert those_that_hold(judge, before, [TWO["row_noise"], TWO["frame_offset"]], fitted, lambda: None) is None
+    assert those_that_hold(judge, before, [TWO["row_noise"], TWO["frame_offset"]], fitted, None, lambda: None) is None
     assert len(asked) == 1
-    assert those_that_hold(judge, before, [TWO["row_noise"]], lambda effects: None, lambda: None) is None
+    assert those_that_hold(judge, before, [TWO["row_noise"]], lambda effects: None, None, lambda: None) is None
 
 
 def test_flats_are_judged_beside_the_darks_held_out():
@@ -188,7 +189,7 @@ def test_flats_are_judged_on_the_part_of_the_sensor_that_was_held_out():
         assert joined.kind == ("dark", "flat") and joined.window == (0, 40, 64, 160) and joined.elsewhere is None
         np.testing.assert_array_equal(joined.counts[1], counts[1][:, :, 40:120])
     assert with_flats(whole.select(exposures=[0]), whole.select(exposures=[1])).shape == (64, 160)
-    fitted, held_out = split_frames(darks, whole)
+    fitted, held_out = split_frames(Portion(darks, (), chosen=(0,)), whole)
     assert Judge.of(fitted, held_out, 0).portion.frames.kind == ("dark", "flat")
 
 

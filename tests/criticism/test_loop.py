@@ -440,7 +440,7 @@ def test_dark_frames_are_held_out_whatever_their_numbers(frames, fitted, held_ou
     if flats:  # between the darks
         counts, kinds = [counts[0], lit, counts[1]], ["dark", "flat", "dark"]
     stack = hsnoise.FrameStack(counts, np.arange(len(counts)), kind=kinds, shutter="global")
-    kept, unseen = split_frames(Portion.of(stack).darks.frames, stack)
+    kept, unseen = split_frames(Portion.of(stack), stack)
     numbers = (fitted[0], 3, fitted[1]) if flats else fitted
     assert kept.n_frames == numbers and kept.kind == stack.kind
     assert (unseen is None) if held_out is None else (unseen.n_frames == held_out)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import hsnoise
 import hsnoise.effects as fx
+from hsnoise.criticism import held_out as of_frames
 from hsnoise.criticism import rules
 from hsnoise.criticism.acceptance import Held
+from hsnoise.criticism.held_out import Judge, split_frames
 from hsnoise.criticism.limit import Limit
 from hsnoise.criticism.outcomes import Improvement
 from hsnoise.criticism.story import Step, Story
 from hsnoise.criticism.work import Work
 from hsnoise.fitting.simulated import Draft
+from hsnoise.simulation.draws import draw_capture
+from hsnoise.simulation.portion import Portion
 
 of = importlib.import_module("hsnoise.criticism.work")
 
@@ -39,7 +45,7 @@ def tried(monkeypatch):
     """What was tried at once; the steps made of it have errors that fall by a third each."""
     found = SimpleNamespace(effects=[])
 
-    def those_that_hold(judge, before, effects, fitted, tick):
+    def those_that_hold(judge, before, effects, fitted, tell, tick):
         found.effects.append([effect.name for effect in effects])
         fit = fitted(effects)
         held = tuple(effect.name for effect in effects)
@@ -140,3 +146,26 @@ def test_a_fit_of_several_that_has_not_settled_is_judged_again(last_step, holds,
     found = Work(None, None, judge, 0, print).finished(held, [Step(before, None, None, None)])
     assert asked == ([] if last_step < 1 else [(MODEL, TWO, 2)])
     assert found == ((whole, again if asked else gain) if holds else None)
+
+
+def test_what_is_missing_is_added_at_once_and_what_is_not_is_left_out(monkeypatch):
+    monkeypatch.setattr(of_frames, "DRAWS", of_frames.LEAST_DRAWS)
+    true = {"row_noise": 1.5, "frame_offset": 3.0}
+    truth = MODEL.add(fx.RowNoise(true["row_noise"])).add(fx.FrameOffset(true["frame_offset"]))
+    counts = [np.full((12, 48, 64), 80, np.uint16)] * 3
+    whole = draw_capture(7, truth, hsnoise.FrameStack(counts, (0.02, 0.1, 0.2), shutter="global"))
+    fitted, held_out = split_frames(Portion.of(whole), whole)
+    judge, told = Judge.of(fitted, held_out, 0), []
+    start = hsnoise.fit(fitted, model=MODEL)
+    working = Work(fitted, Portion.of(fitted), judge, 0, lambda event: told.append(str(event)))
+    first = working.step(start, None, [])
+    tried = candidates(fx.RowNoise(2.5), fx.ColumnNoise(0.5), fx.FrameOffset(2.0))
+    steps = working.several_that_hold(tried, [replace(first, held_out=judge.score(start.params))])
+    assert {step.added for step in steps} == true.keys()
+    assert any("adding row_noise, column_noise and frame_offset at once" in stage for stage in told)
+    assert any(stage.startswith("column_noise is left out: made no difference by itself") for stage in told)
+    last = steps[-1]
+    for name, size in true.items():
+        value, error, _ = last.fit.table[f"{name}.sigma"]
+        assert abs(value - size) < 3 * error < 0.5 * size
+    assert first.comparison.error > 10 > 2 > last.comparison.error and last.held_out > first.held_out
