@@ -44,8 +44,13 @@ TINY_ERROR = 1e-9  # of statistics whose scatter only draws can show
 Suspect = AbstractEffect | type[AbstractEffect]  # what a user may pass
 
 
-def facts_of(model: NoiseModel, portion: Portion, seed: RandomKey | int) -> CaptureFacts:
-    """What effects need to know about a capture and its fitted model to propose themselves."""
+def facts_of(
+    model: NoiseModel, portion: Portion, seed: RandomKey | int, *, pixels_followed: bool = False
+) -> CaptureFacts:
+    """What effects need to know about a capture and its fitted model to propose themselves.
+
+    pixels_followed: whether the fit follows each pixel over time.
+    """
     part = portion.frames
     darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
     exposures_s = {float(part.exposure_s[i]) for i in darks}
@@ -73,6 +78,7 @@ def facts_of(model: NoiseModel, portion: Portion, seed: RandomKey | int) -> Capt
         code_step=code_step(part),
         comb=None if (comb := comb_in(part)) is None else (comb.sigma, tuple(comb.errors.tolist())),
         row_groups=row_groups_in(part),
+        pixels_followed=pixels_followed,
     )
 
 

@@ -56,6 +56,7 @@ class CaptureFacts:
         code_step: distance of the codes, DN; None if all occur.
         comb: rms of the errors of the codes' widths, DN, and the errors of a period; None if none is certain.
         row_groups: rows, start, row_banks and column_banks of a `RowGroupNoise`; None if no rows are read together.
+        pixels_followed: whether the fit follows each pixel over time, and has looked for what shows there.
     """
 
     effects: tuple[str, ...]
@@ -78,6 +79,7 @@ class CaptureFacts:
     code_step: float | None
     comb: tuple[float, tuple[float, ...]] | None
     row_groups: tuple[int, int, int, int] | None
+    pixels_followed: bool = False
 
     @property
     def dark_e(self) -> float:

@@ -69,7 +69,7 @@ class ElectronMultiplication(AbstractEffect):
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:
-        if facts.read_noise_e > MOST_READ_NOISE_E:
+        if facts.read_noise_e > MOST_READ_NOISE_E or facts.pixels_followed:  # such fits look for a register
             return None
 
         def make(size: float, rng: np.random.Generator) -> ElectronMultiplication:

@@ -185,6 +185,7 @@ def test_a_poor_capture_is_offered_little():
     assert hot.rate == rays.rate == 0 and hot.at_readout > 0 and rays.at_readout > 0
     assert set(built_in(RICH)) == {effect.name for effect in PROPOSED}
     assert "electron_multiplication" not in built_in(dataclasses.replace(RICH, read_noise_e=3.5))
+    assert "electron_multiplication" not in built_in(dataclasses.replace(RICH, pixels_followed=True))
     assert "brighter_fatter" not in built_in(dataclasses.replace(RICH, light_e=500.0))
     assert "row_noise" not in built_in(dataclasses.replace(RICH, effects=("row_noise",)))
     assert "shared_row_gain" not in built_in(dataclasses.replace(RICH, cfa="mono"))
