@@ -72,7 +72,8 @@ class Portion:
             flats = f"{len(single)} flats of a single frame"
             left_out.append(f"{flats} were not compared: one frame cannot separate noise from light")
         if bright:
-            left_out.append(f"{len(bright)} levels of flats were not compared: too many of their pixels are saturated")
+            which = f"{len(bright)} level{'s' * (len(bright) > 1)} of flats not compared"
+            left_out.append(f"{which}: too many of their pixels are saturated")
         if full:
             which = f"{len(full)} level{'s' * (len(full) > 1)} of flats not compared: above {100 * LINEAR:.0f} % of"
             left_out.append(f"{which} saturation, which is where the temporal variance is largest (EMVA 1288)")
