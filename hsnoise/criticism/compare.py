@@ -243,9 +243,16 @@ def _in_words(names: tuple[str, ...], measured: np.ndarray, model: np.ndarray, z
 
 
 def nearer(before: Comparison, after: Comparison) -> tuple[str, ...]:
-    """The statistics that another model describes better, in words, those first that came nearest in deviations."""
-    now = {name: (model, z) for name, _, _, model, z in after.table}
-    gains = [(abs(row[4]) - abs(now[row[0]][1]), row) for row in before.table if row[0] in now]
+    """The statistics that another model describes better, in words, those first that came nearest in deviations.
+
+    What is off by fewer deviations only because draws scatter more is not among them.
+    """
+    now, gains = {name: (model, z) for name, _, _, model, z in after.table}, []
+    for row in before.table:
+        name, _, measured, model, z = row
+        if name in now and z:
+            came = (abs(measured - model) - abs(measured - now[name][0])) / abs(measured - model) * abs(z)
+            gains.append((min(came, abs(z) - abs(now[name][1])), row))
     gains.sort(key=lambda gain: -gain[0])
     return tuple(
         sentences.brought_nearer(name, measured, (model, z), now[name])

@@ -1,9 +1,12 @@
-"""Covariances of estimates from simulated statistics, widened where they claim too much."""
+"""Covariances of estimates, widened where they claim too much."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import special
+
+from hsnoise.likelihood.parameters import numbers_of
+from hsnoise.model import NoiseModel
 
 SURE = 1e-6  # of its standard error, by which a number varies that is held
 MOST_GROWTH = 10.0  # of an error; more is a parameter that the base fit did not know
@@ -50,3 +53,18 @@ def not_surer_than(base: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     widened = covariance * factor[:, None] * factor[None, :]
     widened[np.flatnonzero(~known), np.flatnonzero(~known)] = np.inf  # still not determined
     return widened
+
+
+def with_gain(covariance: np.ndarray, params: NoiseModel, names: list[str], first: int) -> np.ndarray:
+    """Covariance of numbers of which those from `first` on are independent in DN: electrons are DN over the mean gain.
+
+    Without it, what was measured in DN to a percent would seem so in electrons, too, where the gain is known to four.
+    """
+    numbers, gains = {n.name: n for n in numbers_of(params)}, np.asarray(params["gain"].value, float)
+    of_gain = [i for i, name in enumerate(names) if numbers[name].place == ("gain", "value")]
+    slopes = np.zeros((len(names), len(of_gain)))
+    for i, number in enumerate(map(numbers.__getitem__, names)):
+        if i >= first and number.is_in_electrons:
+            slopes[i] = -number.value_in(params) / (len(of_gain) * gains.mean())
+    covariance = covariance + slopes @ covariance[of_gain]  # errors of others may be infinite
+    return covariance + covariance[:, of_gain] @ slopes.T

@@ -42,6 +42,7 @@ from hsnoise.effects import (
     TapGains,
     TapOffsets,
 )
+from hsnoise.fitting.covariances import with_gain
 from hsnoise.fitting.pixel_defects import hot_of, jumps_of, of_most, rays_of, warm_of
 from hsnoise.fitting.pixel_fit import Channel, PixelFit
 from hsnoise.fitting.pixel_flats import LEAST_OF_LINES, LEAST_RESPONSE, Responses, bends_of, of_colours
@@ -378,7 +379,7 @@ def _without_gain(pixel: PixelFit, params: NoiseModel) -> np.ndarray:
 def _covariance(
     pixel: PixelFit, params: NoiseModel, population, black_error: np.ndarray, row_error: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """Fitted names and their covariance: gain, read noise and dark current jointly, the others independently."""
+    """Fitted names and their covariance: gain, read noise and dark current jointly, the others independently in DN."""
     numbers = numbers_of(params)
     joint = [n.name for place in IN_ELECTRONS for n in numbers if n.place == place]
     apart: dict[tuple[str, str], Any] = {("row_gain", "sigma"): row_error}
@@ -391,4 +392,6 @@ def _covariance(
     together = slice(len(joint))
     whole = pixel.covariance if pixel.determined else _without_gain(pixel, params)
     covariance[together, together] = whole[together, together]
+    if pixel.determined:
+        covariance = with_gain(covariance, params, [*joint, *errors], len(joint))
     return (*joint, *errors), covariance

@@ -465,8 +465,9 @@ def test_an_addition_is_explained_by_what_it_brought_nearer():
         table = tuple((name, "tails", 3.0, model, z) for name, model, z in rows)
         return Comparison(1.0, {}, table, (), 1.0, 0.0, ())
 
-    before = found(("worst", 1.0, 90.0), ("its own", 2.0, -30.0), ("as before", 2.5, 5.0))
-    after = found(("worst", 1.1, 89.5), ("its own", 2.9, -1.0), ("as before", 2.5, 5.2))
+    # Of the last, draws only scatter more.
+    before = found(("worst", 1.0, 90.0), ("its own", 2.0, -30.0), ("as before", 2.5, 5.0), ("wider", 2.0, 80.0))
+    after = found(("worst", 1.1, 89.5), ("its own", 2.9, -1.0), ("as before", 2.5, 5.2), ("wider", 2.01, 22.0))
     (words,) = nearer(before, after)
     assert (
         words
