@@ -180,3 +180,13 @@ def test_a_refit_without_a_gain_leaves_it_at_one_and_knows_noise_in_dn():
     of_read = base.names.index("read_noise.sigma")
     _, error, unit = base.shown["read_noise.sigma"]
     assert unit == "DN" and np.sqrt(problem.of_base[of_read, of_read]) == pytest.approx(error, rel=1e-3)
+
+
+@pytest.mark.parametrize(("off", "told"), [(1.0, True), (3.0, False)])
+def test_exposures_that_scatter_by_chance_hide_no_coupled_signal(off, told):
+    """Of 3 % crosstalk in small frames, 7 of 20 captures were not told; bands scatter more than chance allows."""
+    variance, error, apart = np.array([10.0, 12.0, 16.0, 26.0]), 0.12, np.array([1.0, -1.0, -1.0, 1.0])
+    shared = 0.06 * (variance - 10.0) + off * error * apart
+    some = [Along(v, np.array([s, 0.0, 0.0, 0.0]), error, 0.0) for v, s in zip(variance, shared, strict=True)]
+    along, down = of_the_signal(some)
+    assert (along > 0.05) is told and down == 0.0

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from hsnoise._core.robust import robust_sigma
 from hsnoise.statistics.pixels.sample import CORE_SIGMAS
@@ -21,6 +22,7 @@ FAR_BETTER = 2.0  # chi-square by which an explanation fails more than the other
 THERE = 50.0  # chi-square of four correlations by chance: 20 in one of two thousand
 FARTHER = 0.2  # of the covariance of neighbours, with the next pixel but one: none acts on the signal so far
 SIGNIFICANT = 5.0  # standard errors of a correlation of shot noise
+BY_CHANCE = 0.1  # probability of a scatter between exposures below which it widens that error
 LEAST_SHARE = 0.005  # of the read noise; less hardly shows
 MOST_LEFT = 0.2  # of the squares of the correlations, by a ringing that describes them
 SIMPLER = 2.0  # factor by which the chi-square of a frequency between slow and alternating must be less
@@ -135,9 +137,11 @@ def of_the_signal(groups: Sequence[Along]) -> tuple[float, float]:
     covariance = np.linalg.inv(design.T @ design)
     shared = np.array([[one.covariance_dn2[0], one.above_dn2] for one in groups]) / error[:, None]
     both = covariance @ design.T @ shared
-    # Bands of random phases scatter more than pixels.
-    apart = ((shared - design @ both) ** 2).sum(0) / max(len(groups) - 2, 1)
-    chance = SIGNIFICANT * np.sqrt(covariance[1, 1] * np.maximum(np.nan_to_num(apart), 1.0))
+    # Bands of random phases scatter more than pixels; a few exposures do so by chance, too.
+    free = max(len(groups) - 2, 1)
+    apart = np.nan_to_num(((shared - design @ both) ** 2).sum(0))
+    wider = np.where(chi2.sf(apart, free) < BY_CHANCE, np.maximum(apart / free, 1.0), 1.0)
+    chance = SIGNIFICANT * np.sqrt(covariance[1, 1] * wider)
     along, down = np.nan_to_num(both[1]) * (np.abs(both[1]) > chance).any()
     return float(along), float(down)
 
