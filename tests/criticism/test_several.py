@@ -160,9 +160,9 @@ def test_what_is_missing_is_added_at_once_and_what_is_not_is_left_out(monkeypatc
     judge, told = Judge.of(fitted, held_out, 0), []
     start = hsnoise.fit(fitted, model=bright)
     working = Work(fitted, Portion.of(fitted), judge, 0, lambda event: told.append(str(event)))
-    first = working.step(start, None, [])
+    first = replace(working.step(start, None, []), held_out=judge.score(start.params))
     tried = candidates(fx.RowNoise(2.5), fx.ColumnNoise(0.5), fx.FrameOffset(2.0))
-    steps = working.several_that_hold(tried, [replace(first, held_out=judge.score(start.params))])
+    steps = working.several_that_hold(tried, [first])
     assert {step.added for step in steps} == true.keys()
     assert any("adding row_noise, column_noise and frame_offset at once" in stage for stage in told)
     assert any(stage.startswith("column_noise is left out: made no difference by itself") for stage in told)
