@@ -85,7 +85,7 @@ class Work:
         return replace(self, portion=portion, judge=self.judge.without_flats)
 
     def turn(self, steps: list[Step], own: Sequence[Suspect]) -> Ending | None:
-        """Diagnose the last step, and append one more; if there is none, how the story ends.
+        """Diagnose the last step, and append one more, or several at once; if there is none, how the story ends.
 
         TimeIsUp, at the first draw after the limit, leaves `steps` unchanged, except for a diagnosis.
         """

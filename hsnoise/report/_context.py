@@ -233,7 +233,8 @@ def _why(before: Step, after: Step) -> list[str]:
     """Reasons to add the effect, the strongest statistics first."""
     ranking = () if before.diagnosis is None else before.diagnosis.ranking
     score = [f"its log-likelihood ratio is {one.score:.0f}" for one in ranking if one.name == after.added]
-    return [*nearer(before.comparison, after.comparison)[:2], *score]
+    beside = [f"it was fitted together with {sentences.all_of(after.beside)}"] if after.beside else []
+    return [*nearer(before.comparison, after.comparison)[:2], *score, *beside]
 
 
 def _gain(before: Step, after: Step) -> str:

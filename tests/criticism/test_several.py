@@ -20,6 +20,7 @@ from hsnoise.criticism.outcomes import Improvement
 from hsnoise.criticism.story import Step, Story
 from hsnoise.criticism.work import Work
 from hsnoise.fitting.simulated import Draft
+from hsnoise.report._context import steps as page_steps
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
 
@@ -101,7 +102,9 @@ def test_each_effect_is_a_step_of_its_own(tried):
 
 def test_the_story_says_what_was_fitted_together(tried):
     steps = [*first(), *work().several_that_hold(candidates(HOT, ROWS, TAILS), first())]
-    told = " ".join(Story(tuple(steps), of.Ending(of.Ended.UNFINISHED)).details)
+    story = Story(tuple(steps), of.Ending(of.Ended.UNFINISHED))
+    assert page_steps(story)[0]["why"] == ["it was fitted together with row_noise and heavy_tailed_read_noise"]
+    told = " ".join(story.details)
     assert "added hot_pixels, because frames are predicted worse without it" in told and "error 27 -> 18" in told
     assert "(fitted together with hot_pixels and row_noise)" in told
 
