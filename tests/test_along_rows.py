@@ -7,10 +7,18 @@ import pytest
 
 import hsnoise
 from hsnoise import effects as fx
+from hsnoise.criticism.candidates import built_in, facts_of
 from hsnoise.fitting.problem import Problem
 from hsnoise.simulation.draws import draw_capture
 from hsnoise.simulation.portion import Portion
-from hsnoise.statistics.pixels.along_rows import Along, along_rows, of_read_noise, of_the_signal
+from hsnoise.statistics.pixels.along_rows import (
+    Along,
+    Ringing,
+    along_rows,
+    limits_of_the_signal,
+    of_read_noise,
+    of_the_signal,
+)
 
 READ_DN2 = (12.0 * 0.5) ** 2
 
@@ -190,3 +198,28 @@ def test_exposures_that_scatter_by_chance_hide_no_coupled_signal(off, told):
     some = [Along(v, np.array([s, 0.0, 0.0, 0.0]), error, 0.0) for v, s in zip(variance, shared, strict=True)]
     along, down = of_the_signal(some)
     assert (along > 0.05) is told and down == 0.0
+
+
+def test_shot_noise_has_limits_of_what_neighbours_share():
+    def of(share, read=0.0):
+        variance = np.array([10.0, 12.0, 16.0, 26.0])
+        return [Along(v, np.array([read + share * v, 0.0, 0.0, 0.0]), 0.02 * v**0.5, 0.0) for v in variance]
+
+    low, high = limits_of_the_signal(of(0.03), None).along
+    assert low < 0.03 < high and high - low < 0.06
+    assert limits_of_the_signal(of(0.03)[:1], None) == ((-np.inf, np.inf), (-np.inf, np.inf))
+    ringing = Ringing((0.1, 0.01), (0.3, 0.01), (0.8, 0.02))
+    assert limits_of_the_signal(of(0.001, read=0.4), ringing).along == (0.0, 0.0)
+    assert limits_of_the_signal(of(0.05), ringing).along == limits_of_the_signal(of(0.05), None).along
+    assert limits_of_the_signal(of(0.001, read=0.4), ringing).down[0] < 0
+
+
+def test_ringing_read_noise_does_not_pass_for_a_coupled_signal_in_diagnoses():
+    """The SBIG ST-8 rings in several tones: what one of them left was taken for coupling, with 2 % of gain."""
+    more = fx.HotPixels(0.02, 20.0), fx.DarkCurrentNonuniformity(0.3)
+    for effect, may in ((fx.CorrelatedReadNoise(0.3, 0.21, 0.8), False), (fx.ReadoutBandwidth(0.06), True)):
+        stack = drawn(effect, (0.0, 20.0, 60.0), more=more)
+        fit = hsnoise.fit(stack)
+        assert ("correlated_read_noise" in fit.params) is not may
+        facts = facts_of(fit.params, Portion.of(stack), 0, fit.transfer)
+        assert facts.pixels_followed and ("readout_bandwidth" in built_in(facts)) is may

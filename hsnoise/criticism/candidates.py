@@ -26,6 +26,7 @@ from hsnoise.effects import (
     ReadNoise,
     ShotNoise,
 )
+from hsnoise.fitting.pixel_fit import PixelFit
 from hsnoise.frames.stack import FrameStack
 from hsnoise.model import NoiseModel
 from hsnoise.simulation.draws import black_level_of, check_effects, check_fits, draw_capture, light_of
@@ -44,12 +45,10 @@ TINY_ERROR = 1e-9  # of statistics whose scatter only draws can show
 Suspect = AbstractEffect | type[AbstractEffect]  # what a user may pass
 
 
-def facts_of(
-    model: NoiseModel, portion: Portion, seed: RandomKey | int, *, pixels_followed: bool = False
-) -> CaptureFacts:
+def facts_of(model: NoiseModel, portion: Portion, seed: RandomKey | int, pixel: PixelFit | None = None) -> CaptureFacts:
     """What effects need to know about a capture and its fitted model to propose themselves.
 
-    pixels_followed: whether the fit follows each pixel over time.
+    pixel: what a fit that follows each pixel over time has measured; None for other fits.
     """
     part = portion.frames
     darks = [i for i, kind in enumerate(part.kind) if kind == "dark"]
@@ -57,7 +56,7 @@ def facts_of(
     longest = max(exposures_s)
     key = key_for(seed, Purpose.LINES)
     drawn = [draw_capture(jax.random.fold_in(key, number), model, part) for number in range(LINE_DRAWS)]
-    return CaptureFacts(
+    facts = CaptureFacts(
         effects=model.names,
         cfa=model.cfa,
         shutter=part.shutter,
@@ -78,8 +77,8 @@ def facts_of(
         code_step=code_step(part),
         comb=None if (comb := comb_in(part)) is None else (comb.sigma, tuple(comb.errors.tolist())),
         row_groups=row_groups_in(part),
-        pixels_followed=pixels_followed,
     )
+    return facts if pixel is None else replace(facts, pixels_followed=True, coupled=pixel.coupled)
 
 
 def built_in(facts: CaptureFacts) -> dict[str, Maker]:

@@ -132,8 +132,7 @@ def _diagnosed(fit, portion: Portion, candidates, draws: int, seed: int, tick) -
 def _by_draws(fit, portion: Portion, candidates, draws: int, seed: RandomKey, tick) -> tuple[Diagnosis, Evidence]:
     """A diagnosis, and what it was made from."""
     model = fit.params if isinstance(fit, FitResult) else fit
-    followed = isinstance(fit, FitResult) and fit.transfer is not None
-    facts = facts_of(model, portion, seed, pixels_followed=followed)
+    facts = facts_of(model, portion, seed, fit.transfer if isinstance(fit, FitResult) else None)
     own = check_makers(candidates, model, portion.frames, facts)
     unseen = [one.name for one in candidates if one.name not in own]
     if unseen:

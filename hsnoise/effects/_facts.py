@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 Maker = Callable[[float, np.random.Generator], "AbstractEffect"]
 
+NO_LIMITS = (-np.inf, np.inf), (-np.inf, np.inf)
+LEAST_SHARED = 0.01  # of shot noise, with a neighbour: less changes gains by less than 2 %
 LEAST_ELECTRONS = 0.2  # of a signal, below which nothing that acts on it shows
 
 
@@ -57,6 +59,8 @@ class CaptureFacts:
         comb: rms of the errors of the codes' widths, DN, and the errors of a period; None if none is certain.
         row_groups: rows, start, row_banks and column_banks of a `RowGroupNoise`; None if no rows are read together.
         pixels_followed: whether the fit follows each pixel over time, and has looked for what shows there.
+        coupled: least and most correlation of shot noise with that of neighbours along rows, and down columns, that the
+            fit allows.
     """
 
     effects: tuple[str, ...]
@@ -80,6 +84,7 @@ class CaptureFacts:
     comb: tuple[float, tuple[float, ...]] | None
     row_groups: tuple[int, int, int, int] | None
     pixels_followed: bool = False
+    coupled: tuple[tuple[float, float], tuple[float, float]] = NO_LIMITS
 
     @property
     def dark_e(self) -> float:
@@ -90,6 +95,11 @@ class CaptureFacts:
     def signal_e(self) -> float:
         """Mean electrons of a pixel, from light or dark current, in the exposure with the most."""
         return max(self.dark_e, self.light_e)
+
+    def may_share(self, sign: int, axis: int = 0) -> bool:
+        """Whether neighbours along rows (axis 0) or down columns (1) may share LEAST_SHARED or more, of this sign."""
+        low, high = self.coupled[axis]
+        return (high if sign > 0 else -low) > LEAST_SHARED
 
     @property
     def shows_dark_current(self) -> bool:

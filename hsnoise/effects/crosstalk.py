@@ -41,6 +41,8 @@ class Crosstalk(AbstractEffect):
         return signal + self.fraction * (above + below + left + right - 4 * signal)
 
     @classmethod
-    def propose(cls, facts: CaptureFacts) -> Maker:
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
+        if not (facts.may_share(1) and facts.may_share(1, axis=1)):
+            return None
         # Four neighbours get it, and correlations are measured to some thousandths. A fifth is a mean over all five.
         return lambda size, rng: cls(min(0.015 * size, 0.2))

@@ -31,6 +31,6 @@ class ReadoutBandwidth(AbstractEffect):
         return signal - self.fraction * step_from_previous(signal)
 
     @classmethod
-    def propose(cls, facts: CaptureFacts) -> Maker:
+    def propose(cls, facts: CaptureFacts) -> Maker | None:
         # Correlations of neighbours are measured to some thousandths.
-        return lambda size, rng: cls(0.03 * size)
+        return (lambda size, rng: cls(0.03 * size)) if facts.may_share(1) else None

@@ -39,7 +39,7 @@ from hsnoise.fitting.pixel_warm import warm_in
 from hsnoise.likelihood.flat_gain import FlatGain, flat_gain, row_gain_of
 from hsnoise.likelihood.flats import FlatMoments
 from hsnoise.likelihood.summary import Summary
-from hsnoise.statistics.pixels.along_rows import Ringing, of_read_noise, shared_by_row
+from hsnoise.statistics.pixels.along_rows import Limits, Ringing, limits_of_the_signal, of_read_noise, shared_by_row
 from hsnoise.statistics.pixels.banding import Banding
 from hsnoise.statistics.pixels.classes import Levels, hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.comb import Comb
@@ -135,6 +135,7 @@ class PixelFit:
     comb: codes of unequal width, if they are. settling: the course of the black level over the frames, if it has one.
     tilted: lines over rows or columns that are new in each frame, if there are; in no noise of rows or columns.
     shortest_s: the shortest exposure of repeated darks; 0 without any.
+    coupled: limits of what shot noise shares with that of neighbours.
     estimate: gain [channel], read noise (e-), dark current (e-/s); `determined`: whether all gains are.
     """
 
@@ -150,6 +151,7 @@ class PixelFit:
     settling: Settling | None
     tilted: Tilted | None
     shortest_s: float
+    coupled: Limits
     estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     determined: bool = False
@@ -183,7 +185,9 @@ def measure(found: Survey, summary: Summary) -> PixelFit:
         channels = [_without_rows_of(ringing, one, shortest_of(found, c)) for c, one in enumerate(channels)]
     apart = ringing, found.row_groups, taps, found.code_step, parity_told, found.waves, found.comb, found.settling
     shortest_s = 0.0 if found.shortest is None else found.shortest.exposure_s
-    return PixelFit(tuple(channels), flats, *apart, tilted, shortest_s, estimate, covariance, bool(known.all()))
+    coupled = limits_of_the_signal(found.along, ringing)
+    joint = estimate, covariance, bool(known.all())
+    return PixelFit(tuple(channels), flats, *apart, tilted, shortest_s, coupled, *joint)
 
 
 def _channel(

@@ -21,7 +21,7 @@ ALIKE = 1.15  # factor of the least variance up to which groups have hardly anyt
 FAR_BETTER = 2.0  # chi-square by which an explanation fails more than the other
 THERE = 50.0  # chi-square of four correlations by chance: 20 in one of two thousand
 FARTHER = 0.2  # of the covariance of neighbours, with the next pixel but one: none acts on the signal so far
-SIGNIFICANT = 5.0  # standard errors of a correlation of shot noise
+SIGNIFICANT, WITHIN = 5.0, 3.0  # standard errors of a correlation of shot noise: from which it is there; of its limits
 BY_CHANCE = 0.1  # probability of a scatter between exposures below which it widens that error
 LEAST_SHARE = 0.005  # of the read noise; less hardly shows
 MOST_LEFT = 0.2  # of the squares of the correlations, by a ringing that describes them
@@ -40,6 +40,13 @@ class Along(NamedTuple):
     covariance_dn2: np.ndarray
     error_dn2: float
     above_dn2: float = float("nan")
+
+
+class Limits(NamedTuple):
+    """Between which the correlation of shot noise with that of neighbours lies: along rows, and down columns."""
+
+    along: tuple[float, float]
+    down: tuple[float, float]
 
 
 class Ringing(NamedTuple):
@@ -129,8 +136,29 @@ def of_the_signal(groups: Sequence[Along]) -> tuple[float, float]:
 
     0 where it is not, or is not known.
     """
+    shared, error = _of_shot_noise(groups)
+    along, down = np.nan_to_num(shared) * (np.abs(shared) > SIGNIFICANT * error).any()
+    return float(along), float(down)
+
+
+def limits_of_the_signal(groups: Sequence[Along], ringing: Ringing | None) -> Limits:
+    """Between which that correlation lies; infinite where it is not known.
+
+    ringing: of the read noise. Where it is told from the signal, and shot noise may have nothing of it, it has nothing:
+    what a ringing does not describe would else pass for a coupled signal.
+    """
+    shared, error = _of_shot_noise(groups)
+    known = np.isfinite(shared)
+    low, high = np.where(known, shared - WITHIN * error, -np.inf), np.where(known, shared + WITHIN * error, np.inf)
+    if ringing is not None and known[0] and low[0] < 0 < high[0]:
+        low[0] = high[0] = 0.0
+    return Limits(*((float(a), float(b)) for a, b in zip(low, high, strict=True)))
+
+
+def _of_shot_noise(groups: Sequence[Along]) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of shot noise along rows and down columns, and its errors [2]; NaN where it is not known."""
     if not _by_noise(groups)[1]:
-        return 0.0, 0.0
+        return np.full(2, np.nan), np.full(2, np.nan)
     variance, error = (np.array([one[i] for one in groups]) for i in (0, 2))
     # What the read noise adds stays as it is: the slope is that of the shot noise.
     design = np.stack([np.ones(len(groups)), variance], 1) / error[:, None]
@@ -141,9 +169,7 @@ def of_the_signal(groups: Sequence[Along]) -> tuple[float, float]:
     free = max(len(groups) - 2, 1)
     apart = np.nan_to_num(((shared - design @ both) ** 2).sum(0))
     wider = np.where(chi2.sf(apart, free) < BY_CHANCE, np.maximum(apart / free, 1.0), 1.0)
-    chance = SIGNIFICANT * np.sqrt(covariance[1, 1] * wider)
-    along, down = np.nan_to_num(both[1]) * (np.abs(both[1]) > chance).any()
-    return float(along), float(down)
+    return both[1], np.sqrt(covariance[1, 1] * wider)
 
 
 def _by_noise(groups: Sequence[Along]) -> tuple[Along | None, list[Along]]:
