@@ -66,7 +66,7 @@ def test_a_coupled_signal_is_doubted_with_the_error_of_its_gain(effect):
     told = [doubt for doubt in result.doubts if "of their shot noise" in doubt]
     assert bool(told) == (own != 0) and result.grave >= bool(told)
     if told:
-        stated = float(told[0].rpartition("by up to ")[2].partition("%")[0]) / 100
+        stated = float(told[0].rpartition("by about ")[2].partition("%")[0]) / 100
         assert ("too large" in told[0]) == (own < 0) and abs(stated - 2 * abs(shared)) < 0.05
 
 
@@ -77,7 +77,7 @@ def test_a_signal_that_spreads_to_all_sides_is_shared_with_the_pixel_above_too()
     shared = 2 * leak * (1 - 4 * leak) / ((1 - 4 * leak) ** 2 + 4 * leak**2)
     assert np.abs(np.array(of_the_signal(groups(stack))) - shared).max() < 0.025  # five errors
     (told,) = [doubt for doubt in hsnoise.fit(stack).doubts if "of their shot noise" in doubt]
-    stated = float(told.rpartition("by up to ")[2].partition("%")[0]) / 100
+    stated = float(told.rpartition("by about ")[2].partition("%")[0]) / 100
     assert "those above each other" in told and "too small" in told and abs(stated - 4 * shared) < 0.05
 
 

@@ -150,9 +150,10 @@ def _loop_arguments(commands: Any) -> None:
 
 def _limit_arguments(parser: argparse.ArgumentParser) -> None:
     """Limits of the loop."""
-    text = "stop after this time and keep the result so far; the first fit is always finished"
+    text = "stop after this time and keep the result so far; the first fit and what it measures are always finished"
     parser.add_argument("--max-minutes", type=minutes, metavar="M", help=text)
-    parser.add_argument("--max-steps", type=count, metavar="N", help="add at most N effects")
+    text = "add at most N effects, besides those that the first fit measures"
+    parser.add_argument("--max-steps", type=count, metavar="N", help=text)
     parser.add_argument(
         "--resume",
         action="store_true",

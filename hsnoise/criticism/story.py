@@ -120,6 +120,8 @@ class Story:
         added = [step.added for step in self.steps if step.added]
         if self.closed is not None:
             named = sentences.added_in_short(added, self.errors[0], error) if added else ""
+            if last.light == Light.RED:  # its head would contradict a light that is of the frames
+                doubt = f"Do not use its numbers: {last.rest or 'the fit did not converge.'}"
             rest = " ".join(part for part in (named, f"{ended}.", doubt) if part)
             return Conclusion(_light_of_closed(self.closed, last.light), self.closed.summary, rest)
         if not added:

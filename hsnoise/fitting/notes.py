@@ -91,6 +91,8 @@ def _note(number: Number, row: tuple[float, float, str], result: FitResult) -> s
             known = f"{name} is known only to {relative:.0%}, and so are read noise and dark current"
             return f"{known}: add flats, or longer darks."
         case "read_noise", "sigma" if relative > UNDETERMINED:
+            if result.transfer is not None and result.has_gain:
+                return f"{name} is not determined: add bias frames, or darks of shorter exposures."
             in_dn = value * float(np.mean(np.asarray(result.params["gain"].value)))
             return f"{name} is not determined in e-, because the gain is not; in DN it is {in_dn:.3g}."
         case "dark_current", "rate":

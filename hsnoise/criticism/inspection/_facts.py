@@ -17,6 +17,7 @@ from hsnoise.frames.io._overscan import Strip, find, without
 from hsnoise.frames.lazy import LazyFrames, is_dask
 from hsnoise.frames.mosaics import looks_like_a_mosaic
 from hsnoise.frames.stack import FrameStack
+from hsnoise.statistics.pixels.along_rows import neighbours_share
 from hsnoise.statistics.pixels.memory import Memory, memory_of_region
 
 MOST_COUNTS = 1 << 24  # kept in memory
@@ -52,7 +53,8 @@ class GroupFacts:
 
     temporal_dn: noise of a pixel over time, DN; NaN for one frame. hot_dn: how far the hottest 0.1 % of the pixels lie
     above the median, DN. mosaic: whether the pixels of 2 x 2 blocks differ. step_dn: all counts are multiples of it,
-    apart from an offset. memory: what pixels keep of the frame before; None of too few frames.
+    apart from an offset. memory: what pixels keep of the frame before; None of too few frames. neighbours_share: of the
+    noise that neighbours in a row have in common; NaN for one frame.
     """
 
     kind: str
@@ -64,6 +66,7 @@ class GroupFacts:
     mosaic: bool
     step_dn: int
     memory: Memory | None
+    neighbours_share: float
 
     @property
     def name(self) -> str:
@@ -220,6 +223,7 @@ def _of_group(stack: FrameStack, i: int, counts: np.ndarray, facts: list[dict[st
         mosaic=stack.cfa == "mono" and looks_like_a_mosaic(counts[0]),
         step_dn=int(np.gcd.reduce(np.diff(codes))) if len(codes) > 2 else 1,
         memory=memory_of_region(counts),
+        neighbours_share=neighbours_share(counts),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from hsnoise._core.robust import robust_sigma
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, together
-from hsnoise.statistics.pixels.oddities import brighter_kind
+from hsnoise.statistics.pixels.oddities import SMOOTHED, brighter_kind, smoothed_in_words
 
 FAR = 6.0  # robust deviations from which a frame is odd
 LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least this, in DN and in units of a pixel's noise
@@ -45,6 +45,7 @@ def odd_frames(facts: Facts, *, multiplies: bool = False) -> list[str]:
         *_unlit(facts.groups),
         *_off_line(facts.groups),
         *_filtered(darks),
+        *_smoothed(darks),
     ]
 
 
@@ -55,8 +56,17 @@ def _filtered(darks: Sequence[GroupFacts]) -> list[str]:
         for group in darks
         if group.temporal_dn > LEAST_NOISE_DN and len({frame.fingerprint for frame in group.frames}) == group.n_frames
     ]
-    memory = together([group.memory for group in clear if group.memory is not None])
+    told = [(group.memory, group.temporal_dn) for group in clear if group.memory is not None]
+    quiet_dn = min((group.temporal_dn for group in darks if group.temporal_dn > 0), default=0.0)
+    memory = together([one for one, _ in told], [noise_dn for _, noise_dn in told], quiet_dn)
     return [] if memory is None else [memory.sentence.rstrip(".")]
+
+
+def _smoothed(darks: Sequence[GroupFacts]) -> list[str]:
+    """Noise of a pixel that its neighbours have, too."""
+    wide = [group for group in darks if group.temporal_dn > LEAST_NOISE_DN and group.neighbours_share > SMOOTHED]
+    most = max(wide, key=lambda group: group.neighbours_share, default=None)
+    return [] if most is None else [smoothed_in_words(most.neighbours_share, most.name).rstrip(".")]
 
 
 def _identical(groups: Sequence[GroupFacts]) -> list[str]:
@@ -112,7 +122,8 @@ def _odd_level(group: GroupFacts, j: int, off_dn: float, darks: Sequence[GroupFa
     if off_dn > LIT * group.temporal_dn:
         return f"{where} others: light got in, or its exposure or temperature differs; leave it out"
     if j == 0:
-        return f"{where} later ones: the black level settles after a pause; leave the first frame out"
+        lag = ", or pixels keep some charge of the frame before (image lag)" if off_dn < 0 and group.exposure_s else ""
+        return f"{where} later ones: the black level settles after a pause{lag}; leave the first frame out"
     return f"{where} others: the black level jumps"
 
 

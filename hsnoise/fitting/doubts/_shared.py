@@ -12,6 +12,7 @@ from hsnoise.statistics.pixels.survey import Survey
 
 COUPLING = {"crosstalk", "brighter_fatter", "readout_bandwidth", "readout_overshoot"}  # effects that act on the signal
 COUPLED, MOST_COUPLED = 0.02, 0.05  # error of the gain by coupled pixels that is reported; that is not trusted
+MOST_TOLD = 0.5  # of such errors, as a number
 
 
 def shared_noise(result: FitResult, found: Survey) -> tuple[list[str], list[str]]:
@@ -37,18 +38,20 @@ def _coupled(shared: tuple[float, float]) -> Iterator[str]:
     """
     (along, down), less = shared, 2 * sum(shared)
     if abs(less) > COUPLED:
+        much = f"about {abs(less):.0%}" if abs(less) < MOST_TOLD else f"{MOST_TOLD:.0%} or more"
         above = f", those above each other {down:+.1%}," if down else ""
         yield (
             f"Neighbours along a row share {along:+.1%}{above} of their shot noise: the signal is coupled (hsnoise"
-            f" diagnose may name it), and the gain comes out too {'small' if less > 0 else 'large'} by up to"
-            f" {abs(less):.0%}."
+            f" diagnose may name it), and the gain comes out too {'small' if less > 0 else 'large'} by {much}."
         )
 
 
 def _memory(found: Survey) -> Memory | None:
     """What pixels keep of the frame before, in darks or, if it is more, in flats: image lag is in electrons alone."""
     told = []
+    quiet_dn = min((group.noise_dn for group in found.repeated_darks), default=0.0)
     for groups in (found.repeated_darks, found.repeated_flats):
         wide = [group for group in groups if group.noise_dn > LEAST_NOISE_DN]
-        told.append(together([p.halves.memory for group in wide for p in group.planes if p.halves.memory is not None]))
+        each = [(one, group.noise_dn) for group in wide for p in group.planes if (one := p.halves.memory) is not None]
+        told.append(together([one for one, _ in each], [noise_dn for _, noise_dn in each], quiet_dn))
     return max((one for one in told if one is not None), key=lambda one: one.share, default=None)

@@ -49,12 +49,13 @@ MOST_CLIPPED = 0.02  # share of counts: where it is cut so near, the noise comes
 LONG_S = 0.5  # of the only dark exposure, from which its dark signal may show
 LEAST_STEPS = 0.8  # of a step of the codes: with less noise rounding is no noise of its own
 MANY_HOT = 0.15  # share of pixels
+BELOW_ZERO = 4.0  # standard errors of a variance
 
 
 def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
-    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _falling, of_pooling)
+    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _below_zero, _falling, of_pooling)
     checks = (single_frames, *coarse, *of_pixels, disagreements)
     open_gain = [*_withheld(result, found)]
     grave = [sentence for check in checks for sentence in check(result, found)]
@@ -179,6 +180,18 @@ def _of_transfer(result: FitResult, found: Survey) -> Iterator[str]:
             )
     if pixel.flats is not None:
         yield from _flats_against_darks(pixel)
+
+
+def _below_zero(result: FitResult, found: Survey) -> Iterator[str]:
+    """A variance that is less than nothing where the photon transfer line ends."""
+    for channel in result.transfer.channels if result.transfer is not None and result.has_gain else ():
+        left, error = channel.values[1] - ROUNDING, float(np.sqrt(channel.covariance[1, 1]))
+        if left < -BELOW_ZERO * error:
+            of = "" if channel.name == "mono" else f" of {channel.name}"
+            yield (
+                f"Without signal the variance of the pixels{of} would be {left:.3g} ± {error:.2g} DN^2, less than"
+                " nothing: an exposure is not what the files say, or what grows with exposure is not all charge."
+            )
 
 
 def _moved_pedestals(result: FitResult) -> Iterator[str]:

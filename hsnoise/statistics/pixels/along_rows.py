@@ -112,6 +112,19 @@ def _product(x: np.ndarray, lag: int) -> float:
     return float(np.mean(x[:, lag:] * x[:, :-lag], dtype=np.float64))
 
 
+def neighbours_share(counts: np.ndarray) -> float:
+    """Correlation along rows of the change between the first two frames, without outliers and row offsets."""
+    if len(counts) < 2:
+        return float("nan")
+    change = counts[1].astype(np.float32) - counts[0]
+    change -= np.median(change, axis=1, keepdims=True)
+    change -= np.median(change, axis=0)
+    width = CORE_SIGMAS * robust_sigma(change)
+    change = np.clip(change, -width, width)
+    variance = float(np.mean(change**2, dtype=np.float64))
+    return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0
+
+
 def of_read_noise(groups: Sequence[Along], read_dn2: float, *, unlit: bool = False) -> Ringing | None:
     """The correlated part of the read noise, DN^2, if it is there and does not act on the signal.
 

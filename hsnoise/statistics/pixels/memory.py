@@ -10,20 +10,30 @@ import numpy as np
 from hsnoise._core.robust import robust_sigma
 
 FEWEST_FRAMES = 4
-PARTS, MOST_PIXELS = 16, 1 << 18  # of a plane, which tell the error
+PARTS, MOST_PIXELS = 64, 1 << 18  # of a plane, which tell the error
 WIDTH = 4.0  # deviations at which differences are cut: jumping and hit pixels say nothing here
 LEAST_NOISE_DN = 0.5  # of a pixel; where a count is wider than the noise, levels decide which frames agree
-LEAST, SURE = 0.01, 5.0  # share that matters, and its standard errors
+LEAST, SURE = 0.01, 4.0  # share that matters, and its standard errors
 
 
 class Memory(NamedTuple):
-    """Share of its temporal noise that a pixel has in common with the frame before, and the error."""
+    """Share of its temporal noise that a pixel has in common with the frame before, and the error.
+
+    of_signal: whether it is a share of the noise of the signal alone, as what a pixel keeps of its charge makes it.
+    """
 
     share: float
     error: float
+    of_signal: bool = False
 
     @property
     def sentence(self) -> str:
+        if self.of_signal:
+            return (
+                f"Pixels have {self.share:.1%} of the noise of their signal in common with the frame before: they keep"
+                " some of its charge (image lag; hsnoise diagnose may name it), or a filter over frames is on. The gain"
+                f" comes out too small by {2 * self.share:.0%} or more."
+            )
         return (
             f"Pixels have {self.share:.1%} of their noise in common with the frame before: a filter over frames"
             " (temporal noise reduction in the camera), or image lag (hsnoise diagnose may name it). Variances come out"
@@ -31,13 +41,30 @@ class Memory(NamedTuple):
         )
 
 
-def together(told: Sequence[Memory]) -> Memory | None:
-    """Of all planes and exposures; None where it may be chance, or is too little to matter."""
+def together(told: Sequence[Memory], noise_dn: Sequence[float], quiet_dn: float) -> Memory | None:
+    """Of all planes and exposures; None where it may be chance, or is too little to matter.
+
+    It is a share of all noise, or of what is beyond that without signal: whichever is surer.
+
+    noise_dn: temporal noise of each; quiet_dn: without signal, as far as it is known.
+    """
     if not told:
         return None
+    beyond = np.clip(1 - (quiet_dn / np.maximum(noise_dn, 1e-6)) ** 2, 0.0, 1.0)
+    of_all, of_signal = _mean(told, np.ones(len(told))), _mean(told, beyond)
+    surest = of_signal._replace(of_signal=True) if _is_surer(of_signal, of_all) else of_all
+    return surest if surest.share > max(LEAST, SURE * surest.error) else None
+
+
+def _mean(told: Sequence[Memory], part: np.ndarray) -> Memory:
+    """The share of a part of the noise [one of told]."""
     weight = np.array([max(one.error, 1e-6) for one in told]) ** -2.0
-    share, error = float(weight @ [one.share for one in told] / weight.sum()), float(weight.sum() ** -0.5)
-    return Memory(share, error) if share > max(LEAST, SURE * error) else None
+    known = max(float(weight @ part**2), 1e-12)
+    return Memory(float(weight * part @ [one.share for one in told]) / known, known**-0.5)
+
+
+def _is_surer(one: Memory, other: Memory) -> bool:
+    return one.share / one.error > other.share / other.error
 
 
 def memory_of_region(counts: np.ndarray) -> Memory | None:

@@ -105,7 +105,8 @@ def moved_frames(found: Survey, offsets_dn: float = 0.0) -> Iterator[str]:
     """
     for group, f, off in _odd_levels(found):
         if offsets_dn < abs(off) <= LIT * group.noise_dn:
-            why = "settles after a pause" if f == 0 else "jumps"
+            lag = ", or pixels keep some charge of the frame before" if off < 0 and group.exposure_s else ""
+            why = f"settles after a pause{lag}" if f == 0 else "jumps"
             yield f"{_called(group, f)} is {abs(off):.3g} DN {_side(off)} than the others: the black level {why}."
 
 
@@ -180,10 +181,15 @@ def smoothed(found: Survey) -> Iterator[str]:
     wide = [one for one in planes if one[1].noise_dn > LEAST_LEVEL_DN]
     share, group = max(wide, key=lambda one: one[0], default=(0.0, None))
     if group is not None and share > SMOOTHED:
-        yield (
-            f"Neighbouring pixels of a row share {share:.0%} of their noise ({name_of(group)}): the frames were"
-            " smoothed, denoised, resized or demosaiced, or the readout is slow. Gain and noise come out too small."
-        )
+        yield smoothed_in_words(share, name_of(group))
+
+
+def smoothed_in_words(share: float, name: str) -> str:
+    """share: of the noise of neighbours in a row, more than SMOOTHED; name: of the frames."""
+    return (
+        f"Neighbouring pixels of a row share {share:.0%} of their noise ({name}): the frames were smoothed, denoised,"
+        " resized or demosaiced, or the readout is slow. Gain and noise come out too small."
+    )
 
 
 def lit_darks(found: Survey) -> Iterator[str]:

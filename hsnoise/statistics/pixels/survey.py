@@ -14,7 +14,7 @@ from hsnoise._core.types import cfa_tile
 from hsnoise.frames.stack import FrameStack
 from hsnoise.statistics.decomposition import Component, PlaneSums, of_neighbouring_rows, with_tails
 from hsnoise.statistics.narrow_noise import narrow_read_noise
-from hsnoise.statistics.pixels.along_rows import Along, along_rows
+from hsnoise.statistics.pixels.along_rows import Along, along_rows, neighbours_share
 from hsnoise.statistics.pixels.banding import Banding, banding_of
 from hsnoise.statistics.pixels.comb import Comb, Histogram, comb_of, histogram_of
 from hsnoise.statistics.pixels.look import Look, OddLines
@@ -303,7 +303,7 @@ def _plane(
         halves=halves,
         single_dn=counts[0].ravel().astype(np.float32) if n == 1 else None,
         blocks_dn=None if half is None or n == 1 else _blocks(counts, half),
-        neighbours_share=_neighbours_share(counts),
+        neighbours_share=neighbours_share(counts),
         narrow_dn=narrow,
         narrow_law=_law(narrow, counts) if looks_at_counts else None,
     )
@@ -351,19 +351,6 @@ def _components(sums: PlaneSums, halves: Halves | None) -> dict[str, Component]:
         return sums.components()
     level = halves.level_dn.mean(0, dtype=np.float64).reshape(-1, sums.shape[1])
     return with_tails(sums.components(), level, halves.pair_variance_dn2, sums.shape)
-
-
-def _neighbours_share(counts: np.ndarray) -> float:
-    """Correlation along rows of the change between the first two frames, without outliers and row offsets."""
-    if len(counts) < 2:
-        return float("nan")
-    change = counts[1].astype(np.float32) - counts[0]
-    change -= np.median(change, axis=1, keepdims=True)
-    change -= np.median(change, axis=0)
-    width = CORE_SIGMAS * robust_sigma(change)
-    change = np.clip(change, -width, width)
-    variance = float(np.mean(change**2, dtype=np.float64))
-    return float(np.mean(change[:, 1:] * change[:, :-1], dtype=np.float64)) / variance if variance > 0 else 0.0
 
 
 def _of_most_frames(stack: FrameStack) -> int | None:
