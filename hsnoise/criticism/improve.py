@@ -16,7 +16,7 @@ from hsnoise.criticism.closing import closed, repeated_darks
 from hsnoise.criticism.held_out import Judge, frames_of_darks, split_frames, split_in_words
 from hsnoise.criticism.limit import NO_LIMIT, Limit, TimeIsUp
 from hsnoise.criticism.outcomes import Ended, Ending
-from hsnoise.criticism.resume import read_steps
+from hsnoise.criticism.resume import read_story, steps_of
 from hsnoise.criticism.story import Story
 from hsnoise.criticism.work import Work, additions, stage_of
 from hsnoise.frames.source import as_stack
@@ -97,6 +97,8 @@ def improved(
     """`improve`, reporting progress as events instead of sentences."""
     keep, seed = callback("keep", keep), seed_of("seed", seed)
     stack, candidates = as_stack(stack, **keywords), check_candidates(candidates)
+    classes = [one if isinstance(one, type) else type(one) for one in candidates]
+    stored = None if resume is None else read_story(resume, seed, classes)
     fitted, held_out = split_frames(Portion.of(stack), stack)
     portion = Portion.of(fitted)
     check_start(model, candidates, portion, seed)
@@ -107,11 +109,10 @@ def improved(
     if close:
         repeated_darks(fitted)  # an error now, not after all the work
     work.say(Event("Fitting the first model"))
-    if resume is None:
+    if stored is None:
         steps = replace(work, limit=NO_LIMIT).started(work.first(model))
     else:
-        classes = [one if isinstance(one, type) else type(one) for one in candidates]
-        steps = read_steps(resume, work.first, model, seed, classes)
+        steps = steps_of(stored, work.first, model)
     while (ending := limit.reached(additions(steps))) is None:
         keep(Story(tuple(steps), Ending(Ended.UNFINISHED), split, seed=seed))
         own = [c for c in candidates if c.name not in steps[-1].fit.params]

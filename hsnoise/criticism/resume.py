@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,20 +55,22 @@ def write_story(path: str | os.PathLike, story: Story) -> None:
     write_atomically(path, (json.dumps({**content, "sha256": _hash(content)}) + "\n").encode())
 
 
-def read_steps(
-    path: str | os.PathLike, refit: Refit, given: NoiseModel | None, seed: int, own: Iterable[type[AbstractEffect]]
-) -> list[Step]:
-    """The steps of a story that `write_story` wrote.
+class Stored(NamedTuple):
+    """What a file of a story holds: of each step, what is not of its fit, and what is."""
+
+    path: Path
+    steps: list[dict[str, Any]]
+    fits: list[dict[str, Any]]
+
+
+def read_story(path: str | os.PathLike, seed: int, own: Iterable[type[AbstractEffect]]) -> Stored:
+    """The story that `write_story` wrote, before anything is fitted.
 
     Args:
-        path: the file.
-        refit: fits the same frames again, with the effects of a model, and following each pixel if asked for.
-        given: the model at which the story started, None for the paper's; seed: of its draws.
-        own: classes of effects that are not built into hsnoise.
+        path: the file. seed: of its draws. own: classes of effects that are not built into hsnoise.
 
     Raises:
-        FileNotFoundError, ValueError: if there is no such file, it is no story, or it is of other frames, of another
-            model or seed.
+        FileNotFoundError, ValueError: if there is no such file, it is no story, or it is of another seed.
     """
     path = Path(path)
     try:
@@ -88,22 +90,31 @@ def read_steps(
         raise ValueError(f"{path}: {expected} ({error!s:.80}); begin anew without {named('resume')}") from error
     if content["seed"] != seed:
         raise ValueError(f"seed: expected {content['seed']}, with which {path} was begun, got {seed}")
-    return _with_frames(path, steps, fits, refit, given)
+    return Stored(path, steps, fits)
 
 
-def _hash(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+def steps_of(stored: Stored, refit: Refit, given: NoiseModel | None) -> list[Step]:
+    """The steps of a story, with their frames.
 
+    Args:
+        stored: the story. refit: fits the same frames again, with the effects of a model, and following each pixel if
+            asked for. given: the model at which the story started, None for the paper's.
 
-def _with_frames(path: Path, steps, fits, refit: Refit, given: NoiseModel | None) -> list[Step]:
-    base = refit(given, fits[0]["status"] == Status.NEARER)
-    _check_same(path, base, fits[0]["params"])
+    Raises:
+        ValueError: if the story is of other frames, or of another model.
+    """
+    base = refit(given, stored.fits[0]["status"] == Status.NEARER)
+    _check_same(stored.path, base, stored.fits[0]["params"])
     measured, found = set(base.added), []
-    for step, of_fit in zip(steps, fits, strict=True):
+    for step, of_fit in zip(stored.steps, stored.fits, strict=True):
         if step["added"] not in {None, *measured} and of_fit["method"] != Method.SYNTHETIC:
             base = refit(of_fit["params"], False)
         found.append(Step(fit=FitResult(**of_fit, **{name: getattr(base, name) for name in OF_FRAMES}), **step))
     return found
+
+
+def _hash(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def _check_same(path: Path, base: FitResult, stored: Any) -> None:

@@ -14,7 +14,7 @@ from hsnoise.criticism import Candidate, Diagnosis, Step, Story, Verdict, write_
 from hsnoise.criticism.compare import Comparison
 from hsnoise.criticism.finding import Unexplained
 from hsnoise.criticism.outcomes import Ended, Ending
-from hsnoise.criticism.resume import OF_FRAMES, read_steps
+from hsnoise.criticism.resume import OF_FRAMES, read_story, steps_of
 from hsnoise.criticism.shares import Share
 from hsnoise.effects import BlackClamp, RowNoise
 from hsnoise.fitting.result import Method, Status
@@ -80,7 +80,7 @@ def again(stack):
 
 
 def test_a_story_comes_back_to_the_last_bit(story, file, stack):
-    steps = read_steps(file, again(stack), None, SEED, ())
+    steps = steps_of(read_story(file, SEED, ()), again(stack), None)
     for step, before in zip(steps, story.steps, strict=True):
         for name in ("added", "held_out", "moved", "ahead"):
             np.testing.assert_equal(getattr(step, name), getattr(before, name))
@@ -99,9 +99,9 @@ def test_a_story_comes_back_to_the_last_bit(story, file, stack):
 
 def test_a_story_of_other_frames_or_another_seed_is_refused(file):
     with pytest.raises(ValueError, match="seed: expected 3, with which .* was begun, got 4"):
-        read_steps(file, again(None), None, 4, ())
+        read_story(file, 4, ())
     with pytest.raises(ValueError, match="resume: the first fit comes out differently from that of .*story.json"):
-        read_steps(file, again(capture(7)), None, SEED, ())
+        steps_of(read_story(file, SEED, ()), again(capture(7)), None)
 
 
 @pytest.mark.parametrize(
@@ -118,10 +118,10 @@ def test_a_story_of_other_frames_or_another_seed_is_refused(file):
         lambda text: json.dumps({**json.loads(text), "steps": {}}),
     ],
 )
-def test_what_is_no_story_is_refused_in_a_sentence(broken, file, stack):
+def test_what_is_no_story_is_refused_in_a_sentence(broken, file):
     file.write_text(broken(file.read_text()))
     with pytest.raises(ValueError, match=r"story.json: expected a story that improve saved"):
-        read_steps(file, again(stack), None, SEED, ())
+        read_story(file, SEED, ())
 
 
 def test_measured_arrays_have_no_place_in_it(story, tmp_path):
