@@ -42,7 +42,7 @@ class BrighterFatter(AbstractEffect):
 
     @classmethod
     def propose(cls, facts: CaptureFacts) -> Maker | None:
-        if facts.signal_e < LEAST_FILL_E:
+        if facts.signal_e < LEAST_FILL_E or not (facts.may_share(1) and facts.may_share(1, axis=1)):
             return None
         # A neighbour takes 1 % at the brightest level, which is 8 % of the variance.
         return lambda size, rng: cls(0.01 * size / (facts.signal_e + 2 * facts.read_noise_e))
