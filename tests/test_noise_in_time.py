@@ -82,6 +82,16 @@ def test_exposures_that_are_not_what_they_say_leave_less_than_no_noise():
     assert any("less than nothing" in doubt for doubt in found.doubts) and not found.trustworthy
 
 
+def test_a_dark_that_the_camera_subtracts_from_each_frame_is_told():
+    """Its fit had given the mean of the noise of all exposures as read noise, with the advice to take longer darks."""
+    rng = np.random.default_rng(6)
+    rate = 40 * rng.lognormal(-0.08, 0.4, SHAPE)
+    counts = [200 + np.rint(electrons(rng, t, rate) - electrons(rng, t, rate)) for t in (0.01, 3.0)]
+    stack = hsnoise.FrameStack([one.astype(np.uint16) for one in counts], (0.01, 3.0), shutter="global")
+    found = hsnoise.fit(stack, method="line")
+    assert any("but their level does not" in doubt for doubt in found.doubts) and str(found.conclusion.light) == "red"
+
+
 @pytest.mark.parametrize("change", [lambda rng, e: e, drifting, wandering, of_frames_and_rows])
 def test_nothing_else_is_taken_for_it(change):
     assert not any("frame before" in doubt for doubt in fit(change).doubts)

@@ -1,4 +1,4 @@
-"""Dark signal that is there without exposure: its shot noise counts as read noise."""
+"""Dark signal that is there without exposure, or that the camera subtracts: of both, the noise stays."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from hsnoise.statistics.pixels.survey import Survey
 FAR = 6.0  # deviations of an offset at which it is cut
 SURE = 5.0  # standard errors of the time
 NOTABLE = 0.05  # share of the variance of read noise
+GROWN, DN_PER_E = 1.5, 50.0  # factor of a variance; more DN for an electron than any camera has
 
 
 def waiting(result: FitResult, found: Survey) -> Iterator[str]:
@@ -51,3 +52,21 @@ def _waiting_s(pixels: Levels) -> tuple[float, float]:
     off = np.clip(off, -width, width)
     terms = (off * (of_growth[::-1] - of_growth.mean())).mean(0)
     return float(terms.mean() / spread), float(terms.std() / np.sqrt(len(terms)) / spread)
+
+
+def noise_alone(result: FitResult, found: Survey) -> Iterator[str]:
+    """Noise that grows with exposure where no signal does: a pooled fit gives the mean of all exposures."""
+    darks = sorted(found.repeated_darks, key=lambda group: group.exposure_s)
+    if result.has_gain or len(darks) < 2 or darks[-1].exposure_s == darks[0].exposure_s:
+        return
+    short, long = darks[0], darks[-1]
+    rise_dn = np.mean(
+        [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(long.planes, short.planes, strict=True)]
+    )
+    grown = long.noise_dn**2 - short.noise_dn**2
+    if grown > (GROWN - 1) * short.noise_dn**2 and DN_PER_E * rise_dn < grown:
+        yield (
+            f"The noise of pixels grows from {short.noise_dn:.3g} DN at {short.exposure_s:g} s to {long.noise_dn:.3g}"
+            f" DN at {long.exposure_s:g} s, but their level does not: the camera subtracts its dark signal, or a dark"
+            " frame from each. Switch that off."
+        )

@@ -3,9 +3,9 @@
 `_drawn`: the components that determine a parameter, measured and in frames drawn from the fit. `_stated`: values from
 headers and the user (gain, black and white level, shutter, colours). `_lines`: rows and columns that are no pattern.
 `_taps`: outputs with gains of their own. `_shared`: noise that is not a pixel's own. `_few`: what two or three frames
-leave open. `_pooled`: what pooled histograms hide. `_waiting`: dark signal without exposure. `_choice`: which of two
-fits to believe. Here: a gain without growth of signal to support it, frames and pixels that measure nothing, and the
-order of all checks.
+leave open. `_pooled`: what pooled histograms hide. `_waiting`: dark signal without exposure, or subtracted. `_choice`:
+which of two fits to believe. Here: a gain without growth of signal to support it, frames and pixels that measure
+nothing, and the order of all checks.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hsnoise.fitting.doubts._register import of_register
 from hsnoise.fitting.doubts._shared import shared_noise
 from hsnoise.fitting.doubts._stated import header_gain, stated
 from hsnoise.fitting.doubts._taps import columns_in_light, gains_differ, outputs, outputs_differ
-from hsnoise.fitting.doubts._waiting import waiting
+from hsnoise.fitting.doubts._waiting import noise_alone, waiting
 from hsnoise.fitting.flat_notes import flat_doubts, gain_notes
 from hsnoise.fitting.notes import is_extraordinary, order_note, pixel_notes
 from hsnoise.fitting.pixel_fit import PixelFit
@@ -55,7 +55,7 @@ BELOW_ZERO = 4.0  # standard errors of a variance
 def checked(result: FitResult, seen: Evidence) -> FitResult:
     """The result with its doubts, and notes on what it does not determine."""
     found, result = seen.survey, _without_open_gain(result)
-    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _below_zero, _falling, of_pooling)
+    coarse, of_pixels = (_noise_below_a_step, _clipped), (_of_transfer, _below_zero, _falling, noise_alone, of_pooling)
     checks = (single_frames, *coarse, *of_pixels, disagreements)
     open_gain = [*_withheld(result, found)]
     grave = [sentence for check in checks for sentence in check(result, found)]
