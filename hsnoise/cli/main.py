@@ -272,13 +272,15 @@ def _show(
 
 
 def _same_story(args: argparse.Namespace, story: Story) -> str:
-    """The options with which a story goes on, beside those of its capture."""
+    """The options with which a story goes on, beside those of its capture; in more minutes, as a search begins anew."""
+    more = 2.0 if story.ending.why == Ended.MINUTES else 1.0
+    minutes = None if args.max_minutes is None else f"{more * args.max_minutes:g}"
     given = {
         "--out": args.out,
         "--model": args.model,
         "--seed": args.seed or None,
         "--report": args.report,
-        "--max-minutes": args.max_minutes,
+        "--max-minutes": minutes,
         "--max-steps": story.ending.limit + MOST_STEPS if story.ending.why == Ended.STEPS else None,
     }
     words = [word for name, value in given.items() if value is not None for word in (name, str(value))]
