@@ -262,3 +262,5 @@ def test_a_story_that_was_stopped_says_how_to_go_on(ending, options, printed, fo
     last_line = printed("improve").splitlines()[-1]
     assert last_line.startswith("To go on: hsnoise improve ") and last_line.endswith(f"/improve{options} --resume")
     assert printed("improve", "--close").splitlines()[-1].endswith(f"/improve{options} --close --resume")
+    minutes = " --max-minutes 4" if ending.why == Ended.MINUTES else " --max-minutes 2"  # a search begins anew
+    assert minutes in printed("improve", "--max-minutes", "2").splitlines()[-1]
