@@ -147,7 +147,7 @@ def test_even_and_odd_columns_of_two_converters(known, rng):
     assert abs(value - 0.16) < 4 * error < 0.1
     assert abs(fit.params["odd_even_pattern"].offset - 1.5 / 0.8) < 0.3
     assert "column_fixed_pattern" not in fit.added
-    assert any("Even and odd columns are read by outputs of their own" in doubt for doubt in fit.doubts)
+    assert any("Even and odd columns differ as if outputs of their own read them" in doubt for doubt in fit.doubts)
 
 
 @pytest.mark.parametrize("seed", range(3))

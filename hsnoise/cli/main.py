@@ -208,6 +208,7 @@ def _improve(args: argparse.Namespace) -> int:
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     if args.resume:
         limits["resume"] = story_in(args.out)
+    _interrupting.on_disk("no model was kept yet, from which --resume could go on")
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
     last = []

@@ -125,6 +125,7 @@ def improved(
     story = Story(tuple(steps), ending, split, seed=seed)
     log.info("Improved: %s", story.ended)
     if close:
+        keep(story)
         work.say(stage_of("closing with measured components", steps))
         before = () if held_out is None else frames_of_darks(fitted)
         try:

@@ -187,7 +187,7 @@ def partly_explained(names: Iterable[str], blamed: str, left: str) -> str:
 
 def not_explained(blamed: str) -> str:
     """Advice where no effect comes near."""
-    return f"none of the effects in the library explains the {blamed} statistics, and none comes near"
+    return f"none of the effects in the library explains the {blamed} statistics, and none comes close"
 
 
 def more_frames(names: Sequence[str]) -> str:

@@ -34,6 +34,7 @@ IN_WORDS = {
     "temporal": "temporal noise of pixels",
 }
 MOST_OF_IT = 0.95  # of the static variance, that the effects named in a sentence hold
+TWICE = 2.0  # times the static variance: what is drawn beyond it is told in DN^2
 
 
 class Share(NamedTuple):
@@ -274,6 +275,11 @@ def in_words(by_effect: dict[str, float], static_dn2: float) -> str:
         return "No named effect explains static variance."
     names = " and ".join([", ".join(said[:-1]), said[-1]] if len(said) > 1 else said)
     verb = "are" if len(said) > 1 else "is"
+    if held > TWICE * static_dn2:
+        draws = "draw" if len(said) > 1 else "draws"
+        return (
+            f"{names} {draws} {held:.2g} DN^2 of static variance; {static_dn2:.2g} DN^2 are measured in these frames."
+        )
     if held > static_dn2:
         return f"{names} {verb} all of the static variance, and draw {100 * (held / static_dn2 - 1):.0f} % more."
     return f"{names} {verb} {100 * held / static_dn2:.0f} % of the static variance."

@@ -301,6 +301,9 @@ def test_the_sentence_names_what_holds_most():
     parts = {"hot_pixels": 90.0, "column_fixed_pattern": 7.0, "row_fixed_pattern": 0.5}
     assert in_words(parts, 100.0) == "hot_pixels and column_fixed_pattern are 97 % of the static variance."
     assert in_words({"hot_pixels": 120.0}, 100.0).endswith("all of the static variance, and draw 20 % more.")
+    assert in_words({"hot_pixels": 120.0}, 8.0).endswith(
+        "draws 1.2e+02 DN^2 of static variance; 8 DN^2 are measured in these frames."
+    )
     assert in_words({}, 100.0) == "No named effect explains static variance."
 
 

@@ -156,7 +156,7 @@ def test_what_remains_is_told_beside_what_is_named():
 def test_an_effect_that_explains_a_part_is_named_in_the_advice():
     partly, hardly = verdict(9.0, None), verdict(18.0, None)
     assert "left would explain part" in partly.advice and partly.unexplained.misfit == pytest.approx(9.0, abs=0.5)
-    assert "none comes near" in hardly.advice and hardly.unexplained.misfit == pytest.approx(20.0, abs=0.5)
+    assert "none comes close" in hardly.advice and hardly.unexplained.misfit == pytest.approx(20.0, abs=0.5)
 
 
 def test_nearest_is_what_explains_most_statistics_however_far_off_the_rest_are():

@@ -222,7 +222,7 @@ def _next_capture(
         return "Darks of a long exposure (30 to 300 s on a cooled camera), eight frames: dark current and hot pixels."
     few = [group.name for group in darks if group.n_frames < 8]
     if few:
-        return f"Eight or more of the {', '.join(few[:3])}: they show what changes from frame to frame."
+        return f"Eight or more frames each of the {', '.join(few[:3])}: they show what changes from frame to frame."
     if gain is None:
         return "Flats in pairs at five brightnesses: they would confirm the gain from the darks."
     if relative >= ROUGH:

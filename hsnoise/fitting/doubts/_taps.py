@@ -87,7 +87,7 @@ def _taps(result: FitResult) -> Taps | None:
 
 def _outputs(taps: Taps) -> str:
     if taps.interleaved:
-        return "Even and odd columns are read by outputs of their own"
+        return "Even and odd columns differ as if outputs of their own read them"
     return f"{taps.rows} x {taps.columns} outputs read blocks of the frame (rows x columns)"
 
 
