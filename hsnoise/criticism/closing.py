@@ -96,7 +96,7 @@ class ClosedModel:
     @property
     def summary(self) -> str:
         """How near the closed model comes, in a sentence."""
-        return sentences.closed(self.comparison.error, self.largest_unexplained)
+        return sentences.closed(self.comparison.error, self.before.error, self.largest_unexplained)
 
     def __str__(self) -> str:
         replaced = sentences.replaced(self.replaced, self.overshot)

@@ -317,9 +317,9 @@ def added(step: int, name: str, reason: str, before: float, after: float, fell: 
     return f"Step {step}: added {name}, because {reason}; error {number(before)} -> {number(after)}{fell}."
 
 
-def closed(error: float, worst: Share | None) -> str:
-    """How near a model closed with measured components comes."""
-    head = f"Closed with measured components: error {error:.3g}"
+def closed(error: float, named: float, worst: Share | None) -> str:
+    """How near a model closed with measured components comes; named: the error without them, in the same frames."""
+    head = f"Closed with measured components: error {error:.3g} ({named:.3g} with the names alone)"
     if worst is None:
         return f"{head}, no component of the noise differs beyond chance."
     left = f"{100 * worst.unexplained_of_total:.2g} % of the variance at {seconds(worst.exposure_s)}"

@@ -84,7 +84,7 @@ def test_patterns_of_any_sensor_go_and_false_effects_too(wild):
     assert "dark_signal_nonuniformity" not in wild.params and wild.named["row_gain"].sigma == 0.05
     assert "Measured whole, because the named effect does not match: row_gain" in str(wild)
     assert "dark_signal_nonuniformity is all of the static variance" not in wild.static
-    assert "error" in wild.summary and "pixel" in str(wild)
+    assert f"({wild.before.error:.3g} with the names alone)" in wild.summary and "pixel" in str(wild)
 
 
 def test_it_saves_loads_and_compares(wild, tmp_path):
