@@ -142,6 +142,20 @@ def test_demo_shows_the_truth_beside_the_fit(tmp_path, monkeypatch, capsys, shor
     assert said.splitlines()[-1] == "Added: row_noise. Error before 40.0, after 1.2."
 
 
+def test_improve_that_is_broken_off_at_once_says_what_there_is(capture, tmp_path, monkeypatch, capsys):
+    def broken_off(*arguments, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_results, "improved", broken_off)
+    arguments = ["improve", str(capture / "darks.npz"), "--shutter", "global", "--out", str(tmp_path)]
+    assert main(arguments) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == "hsnoise: interrupted; no model was kept yet, from which --resume could go on"
+    (tmp_path / "story.json").write_text("of an earlier run")
+    assert main([*arguments, "--resume"]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "hsnoise: interrupted"
+
+
 def test_improve_that_is_broken_off_leaves_its_last_model(capture, tmp_path, monkeypatch, short_loop, capsys):
     whole = _results.improved
 

@@ -7,6 +7,7 @@ import re
 import textwrap
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -251,6 +252,14 @@ def test_a_red_story_does_not_call_its_last_fit_usable(doubts, found):
     said = replace(story, steps=(*story.steps[:-1], far)).conclusion
     assert said.light == Light.RED and fit.conclusion.light != Light.RED
     assert fit.conclusion.head not in said.sentence and (fit.conclusion.rest in said.sentence) is bool(doubts)
+
+
+def test_a_closed_model_of_a_red_fit_says_what_may_be_used(found):
+    story, fit = found["improve"], replace(found["fit"], doubts=DOUBTS, grave=True)
+    closed = SimpleNamespace(comparison=story.steps[-1].comparison, largest_unexplained=None, summary="Closed.")
+    said = replace(story, steps=(*story.steps[:-1], replace(story.steps[-1], fit=fit)), closed=closed).conclusion
+    assert fit.conclusion.light == Light.RED and said.light == Light.AMBER
+    assert "Do not use its numbers: " in said.rest and fit.conclusion.head not in said.sentence
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,8 @@ def _improve(args: argparse.Namespace) -> int:
     limits = {"max_minutes": args.max_minutes, "max_steps": args.max_steps, "close": args.close}
     if args.resume:
         limits["resume"] = story_in(args.out)
-    _interrupting.on_disk("no model was kept yet, from which --resume could go on")
+    if limits.get("resume") is None:
+        _interrupting.on_disk("no model was kept yet, from which --resume could go on")
     story = improve_with_progress(stack, args.seed, args.out, source, start, args.report, **limits)
     written = keep(story, args.out, source)
     last = []

@@ -10,6 +10,7 @@ from hsnoise._core.robust import robust_sigma
 from hsnoise.criticism.inspection._facts import Facts, GroupFacts
 from hsnoise.statistics.pixels.memory import LEAST_NOISE_DN, together
 from hsnoise.statistics.pixels.oddities import SMOOTHED, brighter_kind, smoothed_in_words
+from hsnoise.statistics.pixels.structure import MOST_DN_PER_E
 
 FAR = 6.0  # robust deviations from which a frame is odd
 LEAST_DN, LEAST_SHARE = 0.3, 0.15  # and at least this, in DN and in units of a pixel's noise
@@ -18,7 +19,6 @@ SIGNIFICANT = 4.0  # standard errors of a drift
 FEWEST = 5  # frames that can show a drift
 QUIETER, NOISIER = 0.7, 1.4  # of the usual noise of a frame
 AVERAGED = 0.6  # of the variance of a shorter exposure
-UNEXPLAINED_DN_PER_E = 50.0  # no sensor has such a gain: variance grows without signal
 BRIGHTER = 1.3  # hot pixels of a shorter exposure against a longer one's
 FLICKER = 0.02  # of a flat's level
 OFF_LINE = 0.05  # of the light of flats
@@ -58,7 +58,7 @@ def _filtered(darks: Sequence[GroupFacts]) -> list[str]:
     ]
     told = [(group.memory, group.temporal_dn) for group in clear if group.memory is not None]
     quiet_dn = min((group.temporal_dn for group in darks if group.temporal_dn > 0), default=0.0)
-    memory = together([one for one, _ in told], [noise_dn for _, noise_dn in told], quiet_dn)
+    memory = together(told, quiet_dn)
     return [] if memory is None else [memory.sentence.rstrip(".")]
 
 
@@ -179,7 +179,7 @@ def _averaged(darks: Sequence[GroupFacts]) -> Iterator[str]:
     for one, other in zip(several, several[1:], strict=False):
         grown = other.temporal_dn**2 - one.temporal_dn**2
         signal = max(other.level_dn - one.level_dn, 0.0)
-        if other.temporal_dn**2 > 3 * one.temporal_dn**2 and signal * UNEXPLAINED_DN_PER_E < grown:
+        if other.temporal_dn**2 > 3 * one.temporal_dn**2 and signal * MOST_DN_PER_E < grown:
             yield (
                 f"The temporal variance of the {one.name} is {other.temporal_dn**2 / max(one.temporal_dn**2, 1e-9):.3g}"
                 f" times less than that of the {other.name}, without a signal that explains it: averages of frames?"

@@ -53,5 +53,5 @@ def _memory(found: Survey) -> Memory | None:
     for groups in (found.repeated_darks, found.repeated_flats):
         wide = [group for group in groups if group.noise_dn > LEAST_NOISE_DN]
         each = [(one, group.noise_dn) for group in wide for p in group.planes if (one := p.halves.memory) is not None]
-        told.append(together([one for one, _ in each], [noise_dn for _, noise_dn in each], quiet_dn))
+        told.append(together(each, quiet_dn))
     return max((one for one in told if one is not None), key=lambda one: one.share, default=None)

@@ -10,12 +10,13 @@ from hsnoise._core.robust import robust_sigma
 from hsnoise.fitting.result import FitResult
 from hsnoise.statistics.pixels.classes import Levels, hot_from, levels_of, slope_over
 from hsnoise.statistics.pixels.sample import covariance_of
+from hsnoise.statistics.pixels.structure import MOST_DN_PER_E, rise_dn
 from hsnoise.statistics.pixels.survey import Survey
 
 FAR = 6.0  # deviations of an offset at which it is cut
 SURE = 5.0  # standard errors of the time
 NOTABLE = 0.05  # share of the variance of read noise
-GROWN, DN_PER_E = 1.5, 50.0  # factor of a variance; more DN for an electron than any camera has
+GROWN = 1.5  # factor of a variance
 
 
 def waiting(result: FitResult, found: Survey) -> Iterator[str]:
@@ -60,11 +61,8 @@ def noise_alone(result: FitResult, found: Survey) -> Iterator[str]:
     if result.has_gain or len(darks) < 2 or darks[-1].exposure_s == darks[0].exposure_s:
         return
     short, long = darks[0], darks[-1]
-    rise_dn = np.mean(
-        [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(long.planes, short.planes, strict=True)]
-    )
     grown = long.noise_dn**2 - short.noise_dn**2
-    if grown > (GROWN - 1) * short.noise_dn**2 and DN_PER_E * rise_dn < grown:
+    if grown > (GROWN - 1) * short.noise_dn**2 and MOST_DN_PER_E * rise_dn(short, long) < grown:
         yield (
             f"The noise of pixels grows from {short.noise_dn:.3g} DN at {short.exposure_s:g} s to {long.noise_dn:.3g}"
             f" DN at {long.exposure_s:g} s, but their level does not: the camera subtracts its dark signal, or a dark"

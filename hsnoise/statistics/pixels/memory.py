@@ -41,15 +41,16 @@ class Memory(NamedTuple):
         )
 
 
-def together(told: Sequence[Memory], noise_dn: Sequence[float], quiet_dn: float) -> Memory | None:
+def together(of: Sequence[tuple[Memory, float]], quiet_dn: float) -> Memory | None:
     """Of all planes and exposures; None where it may be chance, or is too little to matter.
 
     It is a share of all noise, or of what is beyond that without signal: whichever is surer.
 
-    noise_dn: temporal noise of each; quiet_dn: without signal, as far as it is known.
+    of: what each tells, and its temporal noise, DN; quiet_dn: that without signal, as far as it is known.
     """
-    if not told:
+    if not of:
         return None
+    told, noise_dn = zip(*of, strict=True)
     beyond = np.clip(1 - (quiet_dn / np.maximum(noise_dn, 1e-6)) ** 2, 0.0, 1.0)
     of_all, of_signal = _mean(told, np.ones(len(told))), _mean(told, beyond)
     surest = of_signal._replace(of_signal=True) if _is_surer(of_signal, of_all) else of_all

@@ -24,6 +24,7 @@ MANY_HOT = 0.003  # share of hot pixels that is too large for a component of out
 ROWS_DOMINATE = 4.0  # ratio of the variance of rows over frames to that of pixels at the shortest exposure
 STREAKS = 0.05  # growth of the variance of row means over that of pixels, above which streaks dominate
 MOST_ALIKE = 0.99  # correlation of rows
+MOST_DN_PER_E = 50.0  # no camera has such a gain: variance that grows by more of it grows without a signal
 CLIPPED = 0.6  # share of clipped counts above which moments over time say too little about the noise
 
 
@@ -169,15 +170,19 @@ def fall_of(found: Survey) -> tuple[Group, Group, float] | None:
     for one, other in zip(darks, darks[1:], strict=False):
         if other.exposure_s == one.exposure_s:
             continue
-        fall = np.mean(
-            [p.frame_means_dn.mean() - q.frame_means_dn.mean() for p, q in zip(one.planes, other.planes, strict=True)]
-        )
+        fall = -rise_dn(one, other)
         noise = np.sqrt(np.mean([p.components["temporal"].variance_dn2 for p in one.planes]))
         channels = {p.channel for p in one.planes}
         chance = np.sqrt(sum(np.mean([g.level_error_dn(c) ** 2 for c in channels]) for g in (one, other)))
         if fall > max(noise, SIGNIFICANT * chance):
-            return one, other, float(fall)
+            return one, other, fall
     return None
+
+
+def rise_dn(one: Group, other: Group) -> float:
+    """How much brighter the frames of another exposure are, DN, mean over the planes."""
+    pairs = zip(one.planes, other.planes, strict=True)
+    return float(np.mean([q.frame_means_dn.mean() - p.frame_means_dn.mean() for p, q in pairs]))
 
 
 def noise_spread(found: Survey, channel: int) -> float:
